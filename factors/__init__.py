@@ -1,0 +1,1 @@
+"""Measurement -> GTSAM factor. numpy and gtsam only; keys are arguments; nothing of topograph."""

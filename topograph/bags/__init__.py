@@ -1,0 +1,11 @@
+"""Recordings -> scans, odometry, IMU, fixes, headings and recorded trunks, in time order.
+
+The only room that knows ROS. `Recording` is the door; `BagWriter` is the way back, for the simulator.
+"""
+
+from topograph.bags.config import BagsConfig
+from topograph.bags.messages import Fix, Heading, Imu, Odometry, Trunks
+from topograph.bags.recording import Recording
+from topograph.bags.scan import Scan
+
+__all__ = ["BagsConfig", "Fix", "Heading", "Imu", "Odometry", "Recording", "Scan", "Trunks"]

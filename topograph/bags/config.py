@@ -1,0 +1,28 @@
+"""What of a recording is read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class BagsConfig:
+    """Topics (empty: found by type), frames and stamps of a recording.
+
+    Attributes:
+        topic_*: topic of a stream; "" finds it by its type, "none" ignores the stream.
+        base_frame: the frame whose poses are estimated.
+        extrinsics: frame -> (x, y, z, roll, pitch, yaw) of the sensor in `base_frame`, metres and radians;
+            overrules TF.
+        max_backward_s: a stamp that is further behind the newest of its stream is dropped and counted, s.
+    """
+
+    topic_points: str = ""
+    topic_trunks: str = ""
+    topic_odometry: str = ""
+    topic_imu: str = ""
+    topic_fix: str = ""
+    topic_heading: str = ""
+    base_frame: str = "base_link"
+    extrinsics: dict[str, tuple[float, float, float, float, float, float]] = field(default_factory=dict)
+    max_backward_s: float = 1.0

@@ -1,0 +1,195 @@
+"""One run: one or several bags, read as a single stream of products."""
+
+from __future__ import annotations
+
+import heapq
+import logging
+import struct
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.interfaces import Connection
+from rosbags.typesys import Stores, get_typestore
+
+from topograph.bags import decode, topics
+from topograph.bags.config import BagsConfig
+from topograph.bags.frames import Frames
+from topograph.bags.messages import Fix, Heading, Imu, Odometry, Trunks
+from topograph.bags.salvage import why_unreadable
+from topograph.bags.scan import Scan
+from topograph.bags.scan import decode as decode_scan
+from topograph.errors import InputError
+from topograph.geometry import from_quaternion
+
+log = logging.getLogger(__name__)
+
+Product = Scan | Odometry | Imu | Fix | Heading | Trunks
+
+
+class Recording:
+    """A run's bags, opened. Use as a context manager.
+
+    Attributes:
+        chosen: stream kind -> topic.
+        counts: topic -> number of messages.
+        frames: sensor frames.
+        skipped: reason -> count, filled while reading.
+        duration_s: from the first to the last message, by recording time.
+    """
+
+    def __init__(self, paths: Sequence[Path], config: BagsConfig | None = None) -> None:
+        self.paths = [_resolve(Path(p)) for p in paths]
+        self.config = config or BagsConfig()
+        self.skipped: Counter[str] = Counter()
+        self.frames = Frames(self.config.base_frame, self.config.extrinsics)
+        self.chosen: dict[str, str] = {}
+        self.types: dict[str, str] = {}
+        self.counts: Counter[str] = Counter()
+        self.duration_s = 0.0
+        self._readers: list[AnyReader] = []
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        try:
+            for path in self.paths:
+                reader = _open(path)
+                self._stack.callback(reader.close)
+                self._readers.append(reader)
+            self._index()
+        except BaseException:
+            self._stack.close()
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, tb: TracebackType | None) -> None:
+        self._stack.close()
+
+    def _index(self) -> None:
+        starts, ends = [], []
+        for reader in self._readers:
+            for c in reader.connections:
+                self.types[c.topic] = c.msgtype
+                self.counts[c.topic] += c.msgcount
+            if reader.message_count:
+                starts.append(reader.start_time)
+                ends.append(reader.end_time)
+        if not starts:
+            raise InputError(f"{', '.join(map(str, self.paths))}: no messages; record again or check `topograph inspect`")
+        self.start_ns = min(starts)
+        self.duration_s = (max(ends) - self.start_ns) * 1e-9
+        self.chosen = topics.choose({t: k for t, k in self.types.items() if self.counts[t]}, self.config)
+        self._read_tf()
+
+    def _read_tf(self) -> None:
+        for name, most in (("tf", 500), ("tf_static", 10_000)):  # static last: it wins
+            for reader in self._readers:
+                found = [c for c in reader.connections if c.topic.endswith(name) and c.msgtype == "tf2_msgs/msg/TFMessage"]
+                if not found:
+                    continue
+                for n, (c, _, raw) in enumerate(reader.messages(connections=found)):
+                    if n >= most:
+                        break
+                    for t in reader.deserialize(raw, c.msgtype).transforms:  # type: ignore[attr-defined]
+                        x, q = t.transform.translation, t.transform.rotation
+                        if name == "tf" and t.header.frame_id.lstrip("/") in ("odom", "map", "world"):
+                            continue  # moving frames are not mounts
+                        pose = from_quaternion([x.x, x.y, x.z], [q.x, q.y, q.z, q.w])
+                        self.frames.add(t.header.frame_id, t.child_frame_id, pose)
+
+    def messages(self, kinds: Sequence[str] = tuple(topics.KINDS)) -> Iterator[tuple[str, Product]]:
+        """(kind, product) of the chosen streams in order of recording time; what cannot be used is counted."""
+        wanted = {self.chosen[k]: k for k in kinds if k in self.chosen}
+        newest: dict[str, int] = {}
+        merged = heapq.merge(*(self._raw(i, set(wanted)) for i in range(len(self._readers))), key=lambda m: m[1])
+        for i, log_ns, connection, raw in merged:
+            kind = wanted[connection.topic]
+            product = self._product(kind, self._readers[i], connection, raw)
+            if product is None:
+                continue
+            stamp = product.stamp_ns
+            if stamp <= 0:
+                self.skipped[f"{kind}: no header stamp"] += 1
+                continue
+            last = newest.get(kind, stamp)
+            if stamp < last - int(self.config.max_backward_s * 1e9):
+                self.skipped[f"{kind}: stamp goes backwards"] += 1
+                continue
+            newest[kind] = max(last, stamp)
+            del log_ns
+            yield kind, product
+
+    def _raw(self, i: int, names: set[str]) -> Iterator[tuple[int, int, Connection, Any]]:
+        reader = self._readers[i]
+        found = [c for c in reader.connections if c.topic in names]
+        if not found:
+            return
+        try:
+            for connection, log_ns, raw in reader.messages(connections=found):
+                yield i, log_ns, connection, raw
+        except (AnyReaderError, struct.error, ValueError, EOFError, OSError, RuntimeError) as err:
+            self.skipped[f"rest of {self.paths[i].name}: damaged ({err})"] += 1
+            log.warning("%s: damaged, the rest is left out (%s)", self.paths[i], err)
+
+    def _product(self, kind: str, reader: AnyReader, connection: Connection, raw: Any) -> Product | None:
+        typ = connection.msgtype
+        try:
+            if kind == "imu":
+                return self._finite_imu(decode.unpack_imu(raw, reader.is2))
+            if kind == "odometry":
+                odometry = decode.unpack_odometry(raw, reader.is2)
+                if not np.isfinite(odometry.odom_T_child).all() or not odometry.odom_T_child[3:].any():
+                    self.skipped["odometry: not finite"] += 1
+                    return None
+                return odometry
+            message: Any = reader.deserialize(raw, typ)
+            if kind == "points":
+                return decode_scan(message, decode.stamp_of(message.header))
+            if kind == "fix":
+                return decode.decode_fix(message)
+            if kind == "heading":
+                heading = decode.decode_heading(message)
+                if not np.isfinite(heading.yaw):
+                    self.skipped["heading: not finite"] += 1
+                    return None
+                return heading
+            return decode.decode_trunks(message)
+        except InputError:
+            raise
+        except (AnyReaderError, struct.error, ValueError, IndexError, AssertionError) as err:
+            self.skipped[f"{kind}: cannot be decoded"] += 1
+            log.debug("%s: %s", connection.topic, err)
+            return None
+
+    def _finite_imu(self, imu: Imu) -> Imu | None:
+        if np.isfinite(imu.gyro).all() and np.isfinite(imu.accel).all():
+            return imu
+        self.skipped["imu: not finite"] += 1
+        return None
+
+
+def _resolve(path: Path) -> Path:
+    if not path.exists():
+        raise InputError(f"{path}: no such file or folder")
+    if path.is_dir() and not (path / "metadata.yaml").exists():
+        inside = sorted(p for p in path.iterdir() if p.suffix in (".mcap", ".db3", ".bag"))
+        if len(inside) == 1:
+            return inside[0]
+        raise InputError(f"{path}: a folder without metadata.yaml; name one of its files: {[p.name for p in inside]}")
+    if path.is_file() and path.suffix not in (".bag", ".mcap", ".db3"):
+        raise InputError(f"{path}: not a recording; give a .bag, a .mcap, a .db3 or a ROS 2 folder")
+    return path
+
+
+def _open(path: Path) -> AnyReader:
+    try:
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader.open()
+    except (AnyReaderError, OSError, ValueError, EOFError, struct.error, RuntimeError, AssertionError, KeyError) as err:
+        raise InputError(f"{path}: {why_unreadable(path, err)}") from err
+    return reader

@@ -1,0 +1,126 @@
+"""What really was there: trees and path, read from the folder beside a simulated bag."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from topograph.errors import InputError
+from topograph.geometry import Array, Datum, Stamps, from_quaternion, to_quaternion
+
+_COLUMNS = ("id", "lat", "lon", "h", "x", "y", "z", "axis_x", "axis_y", "axis_z", "diameter", "stems")
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """Trees and path in the ENU frame of `datum` ("world").
+
+    Attributes:
+        trees: (N, 3) where each trunk's axis meets the ground, m.
+        axes: (N, 3) unit vectors, up.
+        diameters: (N,) at 0.8 m above ground, m.
+        stems: (N,) stems that the tree divides into near the ground.
+        stamps_ns: (M,) of the path.
+        world_T_robot: (M, 4, 4).
+        scan_stamps_ns: (S,) of the scans, or empty.
+        returns: (S, N) LiDAR returns from each trunk below 1.6 m in each scan, or empty.
+    """
+
+    datum: Datum
+    trees: Array
+    axes: Array
+    diameters: Array
+    stems: NDArray[np.int64]
+    stamps_ns: Stamps
+    world_T_robot: Array
+    scan_stamps_ns: Stamps
+    returns: NDArray[np.int32]
+
+    def trees_in(self, datum: Datum) -> Array:
+        """(N, 3) tree positions in the ENU frame of another datum, m."""
+        return datum.to_enu(self.datum.to_geodetic(self.trees))
+
+    def save(self, folder: Path) -> None:
+        """Write `trees.csv`, `path.tum`, `datum.json`, `returns.npz` into `folder`."""
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "datum.json").write_text(
+            json.dumps({"lat": self.datum.lat, "lon": self.datum.lon, "h": self.datum.h}) + "\n"
+        )
+        geodetic = self.datum.to_geodetic(self.trees)
+        with (folder / "trees.csv").open("w", newline="") as f:
+            writer = csv.writer(f)
+            writer.writerow(_COLUMNS)
+            for i in range(len(self.trees)):
+                row = [*geodetic[i], *self.trees[i], *self.axes[i], self.diameters[i]]
+                writer.writerow([i, *(repr(float(v)) for v in row), int(self.stems[i])])
+        write_tum(folder / "path.tum", self.stamps_ns, self.world_T_robot)
+        np.savez_compressed(folder / "returns.npz", stamps_ns=self.scan_stamps_ns, returns=self.returns)
+
+    @staticmethod
+    def load(folder: Path) -> Truth:
+        """Read what `save` wrote.
+
+        Raises:
+            InputError: a file is missing or not of this layout.
+        """
+        try:
+            d = json.loads((folder / "datum.json").read_text())
+            with (folder / "trees.csv").open(newline="") as f:
+                rows = list(csv.DictReader(f))
+            stamps, poses = read_tum(folder / "path.tum")
+            scans, returns = np.zeros(0, np.int64), np.zeros((0, len(rows)), np.int32)
+            if (folder / "returns.npz").exists():
+                with np.load(folder / "returns.npz", allow_pickle=False) as z:
+                    scans, returns = z["stamps_ns"], z["returns"]
+        except (OSError, ValueError, KeyError) as err:
+            raise InputError(f"{folder}: not a truth folder ({err}); give the <name>.truth folder beside the bag") from err
+
+        def column(*names: str) -> Array:
+            return np.array([[float(r[n]) for n in names] for r in rows]).reshape(len(rows), len(names))
+
+        return Truth(
+            Datum(d["lat"], d["lon"], d["h"]),
+            column("x", "y", "z"),
+            column("axis_x", "axis_y", "axis_z"),
+            column("diameter")[:, 0],
+            column("stems")[:, 0].astype(np.int64),
+            stamps,
+            poses,
+            scans,
+            returns,
+        )
+
+
+def write_tum(path: Path, stamps_ns: Stamps, poses: Array) -> None:
+    """Poses (N, 4, 4) as TUM: stamp in seconds with 9 decimals, x y z, quaternion x y z w."""
+    q = to_quaternion(poses) if len(poses) else np.zeros((0, 4))
+    with path.open("w") as f:
+        for s, T, r in zip(stamps_ns.tolist(), poses, q, strict=True):
+            values = " ".join(f"{v:.9f}" for v in (*T[:3, 3], *r))
+            f.write(f"{s // 1_000_000_000}.{s % 1_000_000_000:09d} {values}\n")
+
+
+def read_tum(path: Path) -> tuple[Stamps, Array]:
+    """Stamps (N,) in ns and poses (N, 4, 4) of a TUM file; stamps are read without rounding through floats.
+
+    Raises:
+        InputError: a line has not eight numbers.
+    """
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for n, line in enumerate(path.read_text().splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        words = line.split()
+        if len(words) != 8:
+            raise InputError(f"{path}:{n}: {len(words)} columns, TUM has 8 (stamp x y z qx qy qz qw)")
+        whole, _, fraction = words[0].partition(".")
+        stamps.append(int(whole) * 1_000_000_000 + int((fraction + "000000000")[:9]))
+        rows.append([float(w) for w in words[1:]])
+    values = np.array(rows).reshape(-1, 7)
+    return np.array(stamps, np.int64), from_quaternion(values[:, :3], values[:, 3:]).reshape(-1, 4, 4)

@@ -1,1 +1,38 @@
-"""Measurement -> GTSAM factor. numpy and gtsam only; keys are arguments; nothing of topograph."""
+"""Measurement -> GTSAM factor. numpy and gtsam only; keys are arguments; nothing of topograph.
+
+Every function takes plain numbers and arrays, checks them (GTSAM does not), and returns a native factor.
+Poses are 4x4 matrices `map_T_robot`; tangent vectors and their covariances are (rotation, translation), body frame.
+"""
+
+from factors.gnss import fix
+from factors.ground import level
+from factors.heading import heading
+from factors.imu import ImuNoise, bias_walk, preintegrate, preintegrated
+from factors.noise import Kernel, gaussian, robust, sigmas
+from factors.odometry import odometry, odometry_2d
+from factors.pose import from_pose3, to_pose3
+from factors.ranging import range_2d
+from factors.trunk import trunk, trunk_2d, trunk_linear, trunk_residual
+
+__all__ = [
+    "ImuNoise",
+    "Kernel",
+    "bias_walk",
+    "fix",
+    "from_pose3",
+    "gaussian",
+    "heading",
+    "level",
+    "odometry",
+    "odometry_2d",
+    "preintegrate",
+    "preintegrated",
+    "range_2d",
+    "robust",
+    "sigmas",
+    "to_pose3",
+    "trunk",
+    "trunk_2d",
+    "trunk_linear",
+    "trunk_residual",
+]

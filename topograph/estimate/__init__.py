@@ -1,1 +1,10 @@
+"""Sightings + streams -> Estimate: path, trees, covariances.
 
+`graph.solve` (GTSAM) and `average.solve` (the thesis) take the same Problem and give the same Estimate; they do not
+know of each other.
+"""
+
+from topograph.estimate.problem import Estimate, EstimateConfig, Fixes, Headings, Problem
+from topograph.estimate.path import path_at
+
+__all__ = ["Estimate", "EstimateConfig", "Fixes", "Headings", "Problem", "path_at"]

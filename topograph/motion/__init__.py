@@ -1,1 +1,8 @@
+"""Odometry + Imu -> Motion: where dead reckoning says the robot is, at any stamp. No map, no trunks."""
 
+from topograph.motion.inertial import Inertial, align_imu
+from topograph.motion.reckon import Motion, MotionConfig, dead_reckon
+from topograph.motion.streams import Streams, StreamsBuilder
+from topograph.motion.twist import twist_during
+
+__all__ = ["Inertial", "Motion", "MotionConfig", "Streams", "StreamsBuilder", "align_imu", "dead_reckon", "twist_during"]

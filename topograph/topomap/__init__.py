@@ -1,1 +1,5 @@
-
+from dataclasses import dataclass
+@dataclass(frozen=True, slots=True)
+class TopomapConfig:
+    """x"""
+    x: int = 0

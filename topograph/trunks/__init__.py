@@ -1,1 +1,6 @@
+"""Scan -> trunks: a pure function of one scan and the motion during it. No poses, no map."""
 
+from topograph.trunks.config import TrunksConfig
+from topograph.trunks.recorded import from_recorded
+
+__all__ = ["TrunksConfig", "from_recorded"]

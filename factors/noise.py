@@ -1,0 +1,74 @@
+"""Noise models, checked: GTSAM accepts NaN and negative variances silently."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+_ESTIMATORS = {
+    "huber": gtsam.noiseModel.mEstimator.Huber,
+    "cauchy": gtsam.noiseModel.mEstimator.Cauchy,
+    "tukey": gtsam.noiseModel.mEstimator.Tukey,
+    "dcs": gtsam.noiseModel.mEstimator.DCS,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Kernel:
+    """A robust loss: "none", "huber", "cauchy", "tukey" or "dcs", and its constant in standard deviations."""
+
+    name: str = "none"
+    width: float = 1.345
+
+    def weight(self, distance: ArrayLike) -> NDArray[np.float64]:
+        """Weight (...) of residuals whose whitened norm is `distance` (...), as GTSAM's estimators define it."""
+        d = np.asarray(distance, float)
+        k = self.width
+        if self.name == "none":
+            return np.ones_like(d)
+        if self.name == "huber":
+            return np.minimum(1.0, k / np.maximum(d, 1e-12))
+        if self.name == "cauchy":
+            return np.asarray(k * k / (k * k + d * d))
+        if self.name == "tukey":
+            return np.where(d <= k, (1 - (d / k) ** 2) ** 2, 0.0)
+        if self.name == "dcs":
+            return np.where(d * d > k, (2 * k / (k + d * d)) ** 2, 1.0)
+        raise ValueError(f"unknown kernel {self.name!r}")
+
+
+def sigmas(values: ArrayLike) -> Any:
+    """Diagonal noise of standard deviations (d,).
+
+    Raises:
+        ValueError: one is not finite or not positive.
+    """
+    s = np.asarray(values, float)
+    if not (np.isfinite(s).all() and (s > 0).all()):
+        raise ValueError(f"standard deviations must be finite and positive, not {s}")
+    return gtsam.noiseModel.Diagonal.Sigmas(s)
+
+
+def gaussian(cov: ArrayLike) -> Any:
+    """Gaussian noise of a covariance (d, d).
+
+    Raises:
+        ValueError: it is not finite, symmetric and positive definite.
+    """
+    c = np.asarray(cov, float)
+    if not np.isfinite(c).all() or not np.allclose(c, c.T, atol=1e-9 * max(1.0, float(np.abs(c).max()))):
+        raise ValueError("a covariance must be finite and symmetric")
+    if np.linalg.eigvalsh(c)[0] <= 0:
+        raise ValueError("a covariance must be positive definite")
+    return gtsam.noiseModel.Gaussian.Covariance(c)
+
+
+def robust(model: Any, kernel: Kernel) -> Any:
+    """`model` under a robust loss."""
+    if kernel.name == "none":
+        return model
+    return gtsam.noiseModel.Robust.Create(_ESTIMATORS[kernel.name].Create(kernel.width), model)

@@ -1,0 +1,75 @@
+"""A trunk seen from a pose: bearing and range to the landmark (thesis 6.1; Thrun et al., Probabilistic Robotics 6.6).
+
+The detector states a point and its covariance on the robot. GTSAM's native factor wants a direction and a range, so
+the covariance is turned into the bearing's own basis. The native factor bends straight errors into arcs: with an
+error e at range r it is biased by e²/2r. `trunk_linear` is the same measurement as a plain Cartesian residual,
+linearised; the last solver steps use it, and then the limit of exact poses is the average of the sightings.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from factors.noise import Kernel, gaussian, robust, sigmas
+
+Array = NDArray[np.float64]
+
+
+def trunk(pose_key: int, point_key: int, robot_p_trunk: ArrayLike, cov: ArrayLike, kernel: Kernel) -> Any:
+    """Bearing and range from a Pose3 to a Point3, of a point (3,) with covariance (3, 3) in the robot's frame, m.
+
+    Raises:
+        ValueError: not finite, or nearer than 1 cm.
+    """
+    p = np.asarray(robot_p_trunk, float)
+    distance = float(np.linalg.norm(p))
+    if not np.isfinite(distance) or distance < 0.01:
+        raise ValueError("a trunk must be finite and not inside the sensor")
+    bearing = gtsam.Unit3(p)
+    J = np.vstack([np.asarray(bearing.basis()).T / distance, p / distance])
+    return gtsam.BearingRangeFactor3D(
+        pose_key, point_key, bearing, distance, robust(gaussian(J @ np.asarray(cov, float) @ J.T), kernel)
+    )
+
+
+def trunk_2d(pose_key: int, point_key: int, bearing: float, distance: float, sigma: ArrayLike, kernel: Kernel) -> Any:
+    """Bearing (rad) and range (m) from a Pose2 to a Point2; `sigma` (2,) in that order."""
+    return gtsam.BearingRangeFactor2D(pose_key, point_key, gtsam.Rot2(bearing), distance, robust(sigmas(sigma), kernel))
+
+
+def trunk_residual(map_T_robot: Array, map_p_tree: Array, robot_p_trunk: Array) -> tuple[Array, Array, Array]:
+    """Cartesian residual (..., 3) of sightings, and its Jacobians by pose (..., 3, 6) and by tree (..., 3, 3).
+
+    The pose moves as T·Exp(rotation, translation), GTSAM's convention.
+    """
+    Rt = np.swapaxes(map_T_robot[..., :3, :3], -1, -2)
+    q = (Rt @ (map_p_tree - map_T_robot[..., :3, 3])[..., None])[..., 0]
+    by_pose = np.zeros((*q.shape[:-1], 3, 6))
+    by_pose[..., 0, 1], by_pose[..., 0, 2] = -q[..., 2], q[..., 1]
+    by_pose[..., 1, 0], by_pose[..., 1, 2] = q[..., 2], -q[..., 0]
+    by_pose[..., 2, 0], by_pose[..., 2, 1] = -q[..., 1], q[..., 0]
+    by_pose[..., [0, 1, 2], [3, 4, 5]] = -1.0
+    return q - robot_p_trunk, by_pose, Rt
+
+
+def trunk_linear(
+    graph: Any, pose_keys: list[int], point_keys: list[int], poses: Array, trees: Array, points: Array, cov: Array, kernel: Kernel
+) -> Array:
+    """Add N sightings, linearised at `poses` (N, 4, 4) and `trees` (N, 3), to a GaussianFactorGraph.
+
+    `points` (N, 3) and `cov` (N, 3, 3) are the measurements. Returns the kernel's weights (N,).
+    """
+    e, by_pose, by_tree = trunk_residual(poses, trees, points)
+    whiten = np.linalg.inv(np.linalg.cholesky(cov))
+    e = (whiten @ e[..., None])[..., 0]
+    weight = kernel.weight(np.linalg.norm(e, axis=1))
+    root = np.sqrt(weight)[:, None, None]
+    A, B, b = root * (whiten @ by_pose), root * (whiten @ by_tree), -root[..., 0] * e
+    unit = gtsam.noiseModel.Unit.Create(3)
+    for i in np.flatnonzero(weight > 1e-9).tolist():
+        graph.add(gtsam.JacobianFactor(pose_keys[i], A[i], point_keys[i], B[i], b[i], unit))
+    return weight

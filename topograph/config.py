@@ -1,0 +1,101 @@
+"""All of a run's settings: YAML in, resolved YAML out; unknown keys are refused by path."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import TypeAdapter, ValidationError
+
+from topograph.bags import BagsConfig
+from topograph.errors import UsageError
+from topograph.estimate import EstimateConfig
+from topograph.motion import MotionConfig
+from topograph.topomap import TopomapConfig
+from topograph.trees import TreesConfig
+from topograph.trunks import TrunksConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """One block per room."""
+
+    bags: BagsConfig = field(default_factory=BagsConfig)
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    trunks: TrunksConfig = field(default_factory=TrunksConfig)
+    trees: TreesConfig = field(default_factory=TreesConfig)
+    estimate: EstimateConfig = field(default_factory=EstimateConfig)
+    topomap: TopomapConfig = field(default_factory=TopomapConfig)
+
+
+class _Loader(yaml.SafeLoader):
+    """Safe, and without aliases or repeated keys: both hide what a file says."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.events.AliasEvent):
+            raise UsageError("aliases are not allowed in a configuration")
+        return super().compose_node(parent, index)
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        keys = [self.construct_object(k, deep=True) for k, _ in node.value]
+        twice = {k for k in keys if keys.count(k) > 1}
+        if twice:
+            raise UsageError(f"line {node.start_mark.line + 1}: key {sorted(twice)[0]!r} stands twice")
+        return super().construct_mapping(node, deep)
+
+
+def load(path: Path | None, overrides: dict[str, Any] | None = None) -> Config:
+    """Configuration of a YAML file over the defaults, with `overrides` ("room.key" -> value) over both.
+
+    Raises:
+        UsageError: the file is missing, not YAML, or has an unknown key or a value of the wrong kind.
+    """
+    data: dict[str, Any] = {}
+    if path is not None:
+        try:
+            data = yaml.load(path.read_text(), _Loader) or {}  # noqa: S506  # a subclass of the safe loader
+        except (OSError, yaml.YAMLError) as err:
+            raise UsageError(f"{path}: cannot be read as YAML ({err})") from err
+        if not isinstance(data, dict):
+            raise UsageError(f"{path}: a configuration is a mapping of rooms; see `topograph config`")
+    for key, value in (overrides or {}).items():
+        room, _, name = key.partition(".")
+        data.setdefault(room, {})[name] = value
+    return from_dict(data)
+
+
+def from_dict(data: dict[str, Any]) -> Config:
+    """Configuration of nested mappings; missing keys keep their defaults."""
+    rooms = Config.__dataclass_fields__
+    for room, block in data.items():
+        if room not in rooms:
+            raise UsageError(f"configuration: unknown key {room!r}; known are {', '.join(rooms)}")
+        known = getattr(Config(), room).__dataclass_fields__
+        for key in block or {}:
+            if key not in known:
+                raise UsageError(f"configuration: unknown key '{room}.{key}'; known are {', '.join(known)}")
+    try:
+        blocks = {
+            room: TypeAdapter(type(getattr(Config(), room))).validate_python(block or {})
+            for room, block in data.items()
+        }
+    except ValidationError as err:
+        first = err.errors()[0]
+        where = ".".join(str(w) for w in first["loc"])
+        raise UsageError(f"configuration: {where}: {first['msg']}") from err
+    return Config(**blocks)
+
+
+def dump(config: Config) -> str:
+    """The whole configuration as YAML, defaults included."""
+    return yaml.safe_dump(_plain(asdict(config)), sort_keys=False, default_flow_style=None, width=110)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, (tuple, list)):
+        return [_plain(v) for v in value]
+    return value

@@ -1,0 +1,106 @@
+"""Streams -> Problem: fixes and headings tied to keyframes, steps with their noise."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from topograph.estimate.problem import EstimateConfig, Fixes, Headings, Problem
+from topograph.geometry import Array, Datum, Stamps, inverse, transform
+from topograph.motion import Inertial, Motion, MotionConfig, Streams
+from topograph.trees import Detections, Sightings
+from topograph.trees.sightings import nearest_keyframe
+
+
+def empty_sightings() -> Sightings:
+    """No sightings yet."""
+    none = np.zeros(0, np.int64)
+    return Sightings(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)), none)
+
+
+def choose_datum(streams: Streams, keep: NDArray[np.bool_]) -> Datum | None:
+    """Origin of the map frame: the median of the first fixes, rounded to 1e-7° and 1 cm; None with too few."""
+    g = streams.lat_lon_h[keep]
+    if len(g) < 3:
+        return None
+    lat, lon, h = np.median(g[:25], axis=0)
+    return Datum(round(float(lat), 7), round(float(lon), 7), round(float(h), 2))
+
+
+def assemble(
+    keyframes_ns: Stamps,
+    motion: Motion,
+    motion_config: MotionConfig,
+    inertial: Inertial | None,
+    streams: Streams,
+    used_fixes: NDArray[np.bool_],
+    robot_T_antenna: Array,
+    robot_T_baseline: Array,
+    datum: Datum | None,
+    detections: Detections,
+    config: EstimateConfig,
+    skipped: Counter[str],
+) -> Problem:
+    """The problem of a run, without sightings; `used_fixes` (F,) leaves out those that are held out."""
+    odom = motion.at(keyframes_ns)
+    fixes = _fixes(keyframes_ns, odom, motion, streams, used_fixes, robot_T_antenna, datum, config, skipped)
+    headings = _headings(keyframes_ns, odom, motion, streams, robot_T_baseline, datum)
+    return Problem(
+        keyframes_ns, odom, motion.sigma(motion_config, keyframes_ns), motion, motion_config, inertial, fixes, headings,
+        datum, detections, empty_sightings(), 0,
+    )  # fmt: skip
+
+
+def _at_keyframes(keyframes_ns: Stamps, odom: Array, motion: Motion, stamps: Stamps) -> tuple[NDArray[np.int64], Array]:
+    """Nearest keyframe (N,) of stamps and the robot's pose then in it (N, 4, 4)."""
+    k = nearest_keyframe(stamps, keyframes_ns)
+    return k, inverse(odom[k]) @ motion.at(stamps)
+
+
+def _fixes(
+    keyframes_ns: Stamps, odom: Array, motion: Motion, streams: Streams, used: NDArray[np.bool_], robot_T_antenna: Array,
+    datum: Datum | None, config: EstimateConfig, skipped: Counter[str],
+) -> Fixes:  # fmt: skip
+    none = Fixes(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    if datum is None:
+        return none
+    stamps = streams.fix_ns
+    margin = 500_000_000
+    inside = used & (stamps >= keyframes_ns[0] - margin) & (stamps <= keyframes_ns[-1] + margin)
+    skipped["fix: outside the run"] += int((used & ~inside).sum())
+    skipped += Counter()  # zero counts vanish
+    if inside.sum() < 3:
+        return none
+    enu = datum.to_enu(streams.lat_lon_h[inside])
+    k, keyframe_T_robot = _at_keyframes(keyframes_ns, odom, motion, stamps[inside])
+    lever = transform(keyframe_T_robot, robot_T_antenna[:3, 3])
+    cov = streams.fix_cov[inside].copy()
+    h, v = config.fix_floor
+    cov[:, [0, 1, 2], [0, 1, 2]] = np.maximum(cov[:, [0, 1, 2], [0, 1, 2]], np.array([h, h, v]) ** 2)
+    # Fixes of one keyframe err alike: their mean is one fix with the noise of one.
+    ids, index, count = np.unique(k, return_inverse=True, return_counts=True)
+
+    def mean(x: Array) -> Array:
+        out = np.zeros((len(ids), *x.shape[1:]))
+        np.add.at(out, index, x)
+        return np.asarray(out / count.reshape(-1, *([1] * (x.ndim - 1))))
+
+    return Fixes(ids, mean(lever), mean(enu), mean(cov))
+
+
+def _headings(
+    keyframes_ns: Stamps, odom: Array, motion: Motion, streams: Streams, robot_T_baseline: Array, datum: Datum | None
+) -> Headings:
+    stamps = streams.heading_ns
+    inside = (stamps >= keyframes_ns[0]) & (stamps <= keyframes_ns[-1])
+    if datum is None or not inside.any():
+        none = np.zeros(0)
+        return Headings(np.zeros(0, np.int64), np.zeros((0, 3)), none, none)
+    k, keyframe_T_robot = _at_keyframes(keyframes_ns, odom, motion, stamps[inside])
+    direction = (keyframe_T_robot[:, :3, :3] @ robot_T_baseline[:3, 0][:, None])[..., 0]
+    sigma = np.nan_to_num(streams.heading_sigma[inside], nan=0.01)
+    # One per keyframe is enough: the others say the same.
+    first = np.unique(k, return_index=True)[1]
+    return Headings(k[first], direction[first], streams.heading[inside][first], np.maximum(sigma[first], 0.005))

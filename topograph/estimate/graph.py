@@ -1,0 +1,288 @@
+"""The factor graph: poses, velocities, biases and trunks, solved robustly, then once more exactly.
+
+Schedule (shared/GTSAM.md 5): a first path from windows of fixes; poses alone under wide losses; all under Huber;
+all under Tukey with noise scales learned from the residuals; last, Gauss-Newton steps with Cartesian trunk residuals,
+whose linear system also gives the covariances. Odometry and IMU are never robust.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+import factors
+from factors import Kernel
+from topograph.errors import InsufficientDataError
+from topograph.estimate import covariance
+from topograph.estimate.initial import initial_path, yaw_of_direction
+from topograph.estimate.inertia import Inertia, inertia
+from topograph.estimate.problem import Estimate, EstimateConfig, Problem
+from topograph.estimate.solver import levenberg_marquardt, with_big_stack
+from topograph.geometry import Array, inverse, log, transform, wrap
+
+X, V, B, L = (gtsam.symbol(c, 0) for c in "xvbl")
+_NONE = Kernel("none")
+
+
+@dataclass(frozen=True, slots=True)
+class _Pass:
+    """Losses and noise of one solve: least deviation of a fix (m), factors on the noise of trunks and fixes."""
+
+    trunk: Kernel
+    fix: Kernel
+    fix_floor: float = 0.0
+    trunk_scale: float = 1.0
+    fix_scale: float = 1.0
+
+
+def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False) -> Estimate:
+    """Path and trees of a run. `quick` stops after the Huber pass and gives no covariances (for association).
+
+    Raises:
+        InsufficientDataError: the data do not determine the path.
+    """
+    began = time.perf_counter()
+    if problem.start is None:
+        poses = _poses_alone(problem, initial_path(problem), config)
+    else:
+        poses = problem.start
+    trees = _median_trees(problem, poses)
+    huber = Kernel("huber", config.huber)
+    inert = None if quick or not config.use_imu else inertia(problem)
+    values = _values(problem, poses, trees, inert)
+    first = _Pass(huber, huber, 0.05 if quick else 0.0)
+    values = levenberg_marquardt(_graph(problem, first, config, inert), values, 12 if quick else config.iterations, 1e-4)
+    if quick:
+        return _estimate(problem, config, values, first, None, time.perf_counter() - began)
+    scales = _learned_scales(problem, values, first) if config.learn_scale else (1.0, 1.0)
+    tukey = Kernel("tukey", config.tukey)
+    last = _Pass(tukey, tukey, 0.0, *scales)
+    values = levenberg_marquardt(_graph(problem, last, config, inert), values, config.iterations)
+    values, linear = with_big_stack(lambda: _polish(problem, last, config, inert, values))
+    return _estimate(problem, config, values, last, linear, time.perf_counter() - began)
+
+
+def _poses_alone(problem: Problem, poses: Array, config: EstimateConfig) -> Array:
+    """Odometry, fixes and headings only, under losses that narrow from metres to decimetres."""
+    values = _values(problem, poses, np.zeros((0, 3)), None)
+    if len(problem.fixes.keyframe) >= 3:
+        for p in (_Pass(_NONE, Kernel("huber", 1.345), 1.0), _Pass(_NONE, Kernel("cauchy", 1.0), 0.1)):
+            values = levenberg_marquardt(_graph(problem, p, config, None, trunks=False), values, 30, 1e-4)
+    return _path(problem, values)
+
+
+def _values(problem: Problem, poses: Array, trees: Array, inert: Inertia | None) -> Any:
+    values = gtsam.Values()
+    for k, T in enumerate(poses):
+        values.insert(X + k, factors.to_pose3(_orthonormal(T)))
+    for j, p in enumerate(trees):
+        values.insert(L + j, p)
+    if inert is not None:
+        seconds = problem.stamps_ns * 1e-9
+        velocity = np.gradient(poses[:, :3, 3], seconds - seconds[0], axis=0)
+        bias = gtsam.imuBias.ConstantBias(np.zeros(3), inert.gyro_bias)
+        for k in range(len(poses)):
+            values.insert(V + k, velocity[k])
+            values.insert(B + k, bias)
+    return values
+
+
+def _orthonormal(T: Array) -> Array:
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    out = T.copy()
+    out[:3, :3] = U @ Vt
+    return out
+
+
+def _graph(problem: Problem, p: _Pass, config: EstimateConfig, inert: Inertia | None, *, trunks: bool = True) -> Any:
+    g = gtsam.NonlinearFactorGraph()
+    _add_motion(g, problem, inert)
+    _add_fixes(g, problem, p, config)
+    for k, direction, yaw, sigma in zip(
+        problem.headings.keyframe.tolist(), problem.headings.direction, problem.headings.yaw, problem.headings.sigma, strict=True
+    ):
+        g.add(factors.heading(X + k, float(yaw), direction, max(float(sigma), config.heading_floor), Kernel("huber", 1.345)))
+    if trunks:
+        s = problem.sightings
+        cov = p.trunk_scale**2 * s.cov
+        for k, j, z, c in zip(s.keyframe.tolist(), s.tree.tolist(), s.p, cov, strict=True):
+            g.add(factors.trunk(X + k, L + j, z, c, p.trunk))
+        _add_tree_priors(g, problem)
+    return g
+
+
+def _add_tree_priors(g: Any, problem: Problem) -> None:
+    """Keep every tree in the system even when a loss has given up on all its sightings."""
+    wide = factors.sigmas([100.0] * 3)
+    s = problem.sightings
+    first = np.unique(s.tree, return_index=True)[1]
+    T = problem.start if problem.start is not None else problem.odom_T_robot
+    for i in first.tolist():
+        g.add(gtsam.PriorFactorPoint3(L + int(s.tree[i]), transform(T[s.keyframe[i]], s.p[i]), wide))
+
+
+def _add_motion(g: Any, problem: Problem, inert: Inertia | None) -> None:
+    n = len(problem.stamps_ns)
+    if problem.pose_sigma is not None:
+        assert problem.start is not None
+        for k in range(n):
+            g.add(gtsam.PriorFactorPose3(X + k, factors.to_pose3(problem.start[k]), factors.sigmas([problem.pose_sigma] * 6)))
+        return
+    step = inverse(problem.odom_T_robot[:-1]) @ problem.odom_T_robot[1:]
+    sigma = problem.step_sigma.copy()
+    if inert is not None:  # the gyro speaks through its own factor
+        covered = ~np.array([f is None for f in inert.preintegrated])
+        sigma[covered, :3] = np.maximum(5.0 * sigma[covered, :3], 0.05)
+    for k in range(n - 1):
+        g.add(factors.odometry(X + k, X + k + 1, step[k], sigma[k]))
+    georeferenced = len(problem.fixes.keyframe) >= 3
+    first = factors.to_pose3(_orthonormal(problem.start[0] if problem.start is not None else problem.odom_T_robot[0]))
+    loose = [10.0, 10.0, 10.0, 1e4, 1e4, 1e4] if georeferenced else [0.03, 0.03, 1e-3, 1e-3, 1e-3, 1e-3]
+    g.add(gtsam.PriorFactorPose3(X, first, factors.sigmas(loose)))
+    if problem.inertial is None:
+        for k in range(0, n, 10):
+            g.add(factors.level(X + k, 0.3))
+    elif inert is None:  # quick passes: the complementary filter's attitude stands in for the IMU factors
+        for k in range(0, n, 5):
+            up = problem.odom_T_robot[k, 2, :3]
+            g.add(
+                gtsam.AttitudeFactorPose3(X + k, gtsam.Unit3(0, 0, 1), factors.sigmas([0.02, 0.02]), gtsam.Unit3(up))
+            )
+    if inert is not None:
+        inert.add_to(g, X, V, B)
+
+
+def _add_fixes(g: Any, problem: Problem, p: _Pass, config: EstimateConfig) -> None:
+    f = problem.fixes
+    cov = _fix_cov(problem, p, config)
+    for k, lever, z, c in zip(f.keyframe.tolist(), f.keyframe_p_antenna, f.map_p_antenna, cov, strict=True):
+        g.add(factors.fix(X + k, z, lever, c, p.fix))
+
+
+def _fix_cov(problem: Problem, p: _Pass, config: EstimateConfig) -> Array:
+    f = problem.fixes
+    h, v = (max(a, p.fix_floor) for a in config.fix_floor)
+    floor = np.diag([h, h, max(v, p.fix_floor)]) ** 2
+    return np.asarray(p.fix_scale**2 * f.cov + floor)
+
+
+def _median_trees(problem: Problem, poses: Array) -> Array:
+    """(T, 3) median of each tree's projected sightings: a wrong one does not move it."""
+    s = problem.sightings
+    projected = transform(poses[s.keyframe], s.p) if len(s) else np.zeros((0, 3))
+    trees = np.zeros((problem.n_trees, 3))
+    order = np.argsort(s.tree, kind="stable")
+    ends = np.searchsorted(s.tree[order], np.arange(problem.n_trees + 1))
+    for j in range(problem.n_trees):
+        mine = order[ends[j] : ends[j + 1]]
+        if len(mine) == 0:
+            raise InsufficientDataError(f"tree {j} has no sighting")
+        trees[j] = np.median(projected[mine], axis=0)
+    return trees
+
+
+def _path(problem: Problem, values: Any) -> Array:
+    rows = gtsam.utilities.extractPose3(values)  # rotation (9), translation (3), in key order
+    out = np.tile(np.eye(4), (len(problem.stamps_ns), 1, 1))
+    out[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
+    out[:, :3, 3] = rows[:, 9:]
+    return out
+
+
+def _trees(problem: Problem, values: Any) -> Array:
+    return np.array([values.atPoint3(L + j) for j in range(problem.n_trees)]).reshape(-1, 3)
+
+
+def _trunk_residuals(problem: Problem, values: Any, scale: float) -> Array:
+    """Whitened Cartesian residuals (M, 3) of the sightings."""
+    s = problem.sightings
+    if len(s) == 0:
+        return np.zeros((0, 3))
+    e, _, _ = factors.trunk_residual(_path(problem, values)[s.keyframe], _trees(problem, values)[s.tree], s.p)
+    return np.asarray(np.linalg.solve(np.linalg.cholesky(s.cov) * scale, e[..., None])[..., 0])
+
+
+def _fix_residuals(problem: Problem, values: Any) -> Array:
+    f = problem.fixes
+    return np.asarray(transform(_path(problem, values)[f.keyframe], f.keyframe_p_antenna) - f.map_p_antenna)
+
+
+def _learned_scales(problem: Problem, values: Any, p: _Pass) -> tuple[float, float]:
+    """Factors on the noise of trunks and fixes that make the middle of their residuals what a Gaussian's would be.
+
+    Sightings of a tree from places close together err alike; the scale of the trunks grows with that correlation.
+    """
+    trunk, fix = 1.0, 1.0
+    e = _trunk_residuals(problem, values, p.trunk_scale)
+    s = problem.sightings
+    if len(e) > 30:
+        norm = np.linalg.norm(e, axis=1)
+        trunk = float(np.clip(np.median(norm) / 1.538, 0.4, 6.0))  # median of a chi with 3 dof
+        order = np.lexsort((s.keyframe, s.tree))
+        next_to = (np.diff(s.tree[order]) == 0) & (np.diff(s.keyframe[order]) <= 2)
+        a, b = e[order][:-1][next_to], e[order][1:][next_to]
+        good = (np.linalg.norm(a, axis=1) < 4 * trunk) & (np.linalg.norm(b, axis=1) < 4 * trunk)
+        if good.sum() > 30:
+            rho = float(np.clip(np.mean(a[good] * b[good]) / np.mean(0.5 * (a[good] ** 2 + b[good] ** 2)), 0.0, 0.9))
+            trunk *= float(np.sqrt((1 + rho) / (1 - rho)))
+    if len(problem.fixes.keyframe) > 10:
+        r = _fix_residuals(problem, values)[:, :2] / np.sqrt(problem.fixes.cov[:, [0, 1], [0, 1]] + 1e-4)
+        fix = float(np.clip(np.median(np.linalg.norm(r, axis=1)) / 1.177, 1.0, 5.0))
+    return trunk, fix
+
+
+def _polish(problem: Problem, p: _Pass, config: EstimateConfig, inert: Inertia | None, values: Any) -> tuple[Any, Any]:
+    """Gauss-Newton with Cartesian trunk residuals until steps are below a micrometre; the values and the last system."""
+    rest = _graph(problem, p, config, inert, trunks=False)
+    if problem.n_trees:
+        _add_tree_priors(rest, problem)
+    s = problem.sightings
+    keys_x, keys_l = (X + s.keyframe).tolist(), (L + s.tree).tolist()
+    cov = p.trunk_scale**2 * s.cov
+    linear = None
+    for _ in range(8):
+        linear = rest.linearize(values)
+        if len(s):
+            path, trees = _path(problem, values), _trees(problem, values)
+            factors.trunk_linear(linear, keys_x, keys_l, path[s.keyframe], trees[s.tree], s.p, cov, p.trunk)
+        step = linear.optimize()
+        values = values.retract(step)
+        if step.norm() < 1e-7 * max(1.0, np.sqrt(values.size())):
+            break
+    return values, linear
+
+
+def _estimate(problem: Problem, config: EstimateConfig, values: Any, p: _Pass, linear: Any, seconds: float) -> Estimate:
+    poses, trees = _path(problem, values), _trees(problem, values)
+    datum_cov = covariance.of_datum(problem, p.fix_scale, config)
+    joint = None
+    tree_cov = np.full((problem.n_trees, 3, 3), np.nan)
+    if linear is not None and problem.n_trees:
+        keys = [L + j for j in range(problem.n_trees)]
+        joint, tree_cov = with_big_stack(lambda: covariance.of_trees(linear, keys))
+        tree_cov = tree_cov + datum_cov + config.tree_floor**2 * np.diag([1.0, 1.0, 1.0])
+    e = _trunk_residuals(problem, values, p.trunk_scale)
+    residuals = {"trunk": e.ravel(), **_other_residuals(problem, values, p, config)}
+    return Estimate(
+        problem.stamps_ns, poses, trees, tree_cov, joint, datum_cov, np.zeros(0, np.int64),
+        p.trunk.weight(np.linalg.norm(e, axis=1)), residuals, {"trunk": p.trunk_scale, "fix": p.fix_scale}, seconds,
+    )  # fmt: skip
+
+
+def _other_residuals(problem: Problem, values: Any, p: _Pass, config: EstimateConfig) -> dict[str, Array]:
+    poses = _path(problem, values)
+    step = inverse(problem.odom_T_robot[:-1]) @ problem.odom_T_robot[1:]
+    misfit = log(inverse(step) @ inverse(poses[:-1]) @ poses[1:]) / problem.step_sigma
+    out = {"odometry": misfit[:, 3:5].ravel(), "turn": misfit[:, 2]}
+    if len(problem.fixes.keyframe):
+        variance = np.diagonal(_fix_cov(problem, p, config), axis1=1, axis2=2)
+        out["fix"] = (_fix_residuals(problem, values) / np.sqrt(variance)).ravel()
+    h = problem.headings
+    if len(h.keyframe):
+        seen = yaw_of_direction(poses[h.keyframe], h.direction)
+        out["heading"] = wrap(seen - h.yaw) / np.maximum(h.sigma, config.heading_floor)
+    return out

@@ -1,0 +1,135 @@
+"""What an estimator is given, and what it gives back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from topograph.geometry import Array, Datum, Stamps
+from topograph.motion import Inertial, Motion, MotionConfig
+from topograph.trees import Detections, Sightings
+
+
+@dataclass(frozen=True, slots=True)
+class EstimateConfig:
+    """Noise and schedule; SI units.
+
+    Attributes:
+        keyframe_distance, keyframe_turn, keyframe_seconds: a new pose after so many m, rad, s.
+        fix_floor: least standard deviations of a fix, horizontal and vertical, m.
+        fix_correlation_s: time constant of GNSS errors: fixes nearer in time are not independent.
+        heading_floor: least standard deviation of a heading, rad.
+        huber, tukey: constants of the first and the last robust pass, in standard deviations.
+        tree_floor: persistent error of a trunk's centre that no number of sightings removes, m.
+        use_imu: IMU factors in the final solve.
+        learn_scale: rescale trunk and GNSS noise by their residuals.
+        iterations: most Levenberg-Marquardt steps of a pass.
+        d_max: of the thesis's Algorithm 3, m.
+    """
+
+    keyframe_distance: float = 0.5
+    keyframe_turn: float = 0.2
+    keyframe_seconds: float = 5.0
+    fix_floor: tuple[float, float] = (0.01, 0.02)
+    fix_correlation_s: float = 30.0
+    heading_floor: float = 0.005
+    huber: float = 1.345
+    tukey: float = 4.685
+    tree_floor: float = 0.008
+    use_imu: bool = True
+    learn_scale: bool = True
+    iterations: int = 40
+    d_max: float = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class Fixes:
+    """G fixes, each tied to the keyframe nearest in time.
+
+    Attributes:
+        keyframe: (G,) index.
+        keyframe_p_antenna: (G, 3) the antenna at the fix's own stamp, in the keyframe's base frame, m.
+        map_p_antenna: (G, 3) ENU, m; `cov` (G, 3, 3).
+    """
+
+    keyframe: NDArray[np.int64]
+    keyframe_p_antenna: Array
+    map_p_antenna: Array
+    cov: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Headings:
+    """H headings: `direction` (H, 3) in the keyframe's frame points to azimuth `yaw` (H,) with `sigma` (H,), rad."""
+
+    keyframe: NDArray[np.int64]
+    direction: Array
+    yaw: Array
+    sigma: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """A run, ready for an estimator.
+
+    Attributes:
+        stamps_ns: (K,) keyframes.
+        odom_T_robot: (K, 4, 4) dead reckoned.
+        step_sigma: (K-1, 6) of the steps between keyframes: rotation (rad), translation (m).
+        motion, motion_config: dead reckoning at any stamp, and its noise.
+        inertial: IMU samples, or None.
+        fixes, headings: may be empty.
+        datum: origin of the map frame, or None without GNSS.
+        detections: all trunks, for the estimator that associates for itself.
+        sightings: associated trunks.
+        n_trees: number of trees in `sightings`.
+        pose_sigma: when the path is known beforehand (`start`), its deviation (m, rad); else None.
+        start: (K, 4, 4) first guess of `map_T_robot`, or None.
+    """
+
+    stamps_ns: Stamps
+    odom_T_robot: Array
+    step_sigma: Array
+    motion: Motion
+    motion_config: MotionConfig
+    inertial: Inertial | None
+    fixes: Fixes
+    headings: Headings
+    datum: Datum | None
+    detections: Detections
+    sightings: Sightings
+    n_trees: int
+    pose_sigma: float | None = None
+    start: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Path, trees and what is known of their errors.
+
+    Attributes:
+        stamps_ns, map_T_robot: (K,), (K, 4, 4).
+        trees: (T, 3) landmarks, m (at the height the detections state).
+        tree_cov: (T, 3, 3) marginal covariances, m²; NaN when the estimator has none.
+        joint: (3T, 3T) covariance of all trees, or None.
+        datum_cov: (3, 3) common error of the whole map in the ENU frame, m²; contained in `tree_cov`.
+        tree: (N,) tree of each detection, -1 for none.
+        weights: (M,) robust weights of the sightings.
+        residuals: factor type -> normalised residuals.
+        scales: factor type -> factor that its noise was multiplied with.
+        seconds: what it took.
+    """
+
+    stamps_ns: Stamps
+    map_T_robot: Array
+    trees: Array
+    tree_cov: Array
+    joint: Array | None
+    datum_cov: Array
+    tree: NDArray[np.int64]
+    weights: Array
+    residuals: dict[str, Array] = field(default_factory=dict)
+    scales: dict[str, float] = field(default_factory=dict)
+    seconds: float = 0.0

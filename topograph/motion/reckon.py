@@ -1,0 +1,205 @@
+"""Dead reckoning: wheels and gyro, integrated; attitude held to gravity by a complementary filter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from topograph.geometry import Array, Stamps, exp, from_quaternion, interpolate, inverse, log, yaw_of
+from topograph.motion.inertial import GRAVITY, Inertial
+from topograph.motion.streams import Streams
+
+
+@dataclass(frozen=True, slots=True)
+class MotionConfig:
+    """How far dead reckoning is trusted; standard deviations of a step of `d` metres, `dt` seconds and turn `a`.
+
+    Attributes:
+        along, across, up: shares of the distance.
+        step: of any step, m.
+        yaw_gyro, yaw_wheels: share of the turn, by what measured it.
+        yaw_rate: rad per √s with a gyro.
+        yaw_distance: rad per √m without one.
+        tilt_distance: rad per √m, roll and pitch without an IMU.
+        tilt_time_s: time constant of the complementary filter that holds roll and pitch to gravity.
+    """
+
+    along: float = 0.02
+    across: float = 0.02
+    up: float = 0.02
+    step: float = 0.003
+    yaw_gyro: float = 0.004
+    yaw_wheels: float = 0.08
+    yaw_rate: float = 4e-4
+    yaw_distance: float = 0.006
+    tilt_distance: float = 0.012
+    tilt_time_s: float = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Dead-reckoned poses `odom_T_robot` (M, 4, 4) at `stamps_ns` (M,), rising.
+
+    Attributes:
+        distance: (M,) metres driven.
+        turned: (M,) radians turned, both ways counted as positive.
+        gyro: the turn is the gyro's.
+        wheels: the distance is the wheels'.
+    """
+
+    stamps_ns: Stamps
+    odom_T_robot: Array
+    distance: Array
+    turned: Array
+    gyro: bool
+    wheels: bool
+
+    def at(self, stamps_ns: Stamps) -> Array:
+        """Poses (K, 4, 4) at any stamps; outside the recording the nearest end holds."""
+        return interpolate(self.stamps_ns, self.odom_T_robot, stamps_ns)
+
+    def distance_at(self, stamps_ns: Stamps) -> Array:
+        """Metres driven (K,) until each stamp."""
+        return np.interp(stamps_ns, self.stamps_ns, self.distance)
+
+    def turned_at(self, stamps_ns: Stamps) -> Array:
+        """Radians turned (K,) until each stamp."""
+        return np.interp(stamps_ns, self.stamps_ns, self.turned)
+
+    def sigma(self, config: MotionConfig, stamps_ns: Stamps) -> Array:
+        """Standard deviations (K-1, 6), rotation then translation, of the steps between stamps (K,)."""
+        d = np.diff(self.distance_at(stamps_ns))
+        a = np.diff(self.turned_at(stamps_ns))
+        dt = np.diff(stamps_ns) * 1e-9
+        if self.gyro:
+            yaw = np.hypot(config.yaw_gyro * a, config.yaw_rate * np.sqrt(dt)) + 2e-4
+            tilt = 0.004 + 0.3 * config.tilt_distance * np.sqrt(d)
+        else:
+            yaw = np.hypot(config.yaw_wheels * a, config.yaw_distance * np.sqrt(d)) + 5e-4
+            tilt = config.tilt_distance * np.sqrt(d) + 5e-4
+        along, across, up = (k * d + config.step for k in (config.along, config.across, config.up))
+        if not self.wheels:
+            along = across = up = 0.5 * dt + 0.05
+        return np.stack([tilt, tilt, yaw, along, across, up], axis=1)
+
+
+def dead_reckon(streams: Streams, inertial: Inertial | None, child_T_robot: Array, config: MotionConfig) -> Motion | None:
+    """Motion of the base from what there is: wheels and IMU, wheels alone, IMU alone; None with neither.
+
+    With the IMU alone the turn is known and the distance is not: the poses stay in place.
+    """
+    n = len(streams.odometry_ns)
+    if n < 2 and inertial is None:
+        return None
+    if n < 2:
+        assert inertial is not None
+        R = _attitude(inertial, None, config)
+        T = np.tile(np.eye(4), (len(R), 1, 1))
+        T[:, :3, :3] = R
+        turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.unwrap(yaw_of(T)))))])
+        return Motion(inertial.stamps_ns, T, np.zeros(len(T)), turned, True, False)
+    odom_T_robot = streams.odom_T_child @ child_T_robot
+    step = inverse(odom_T_robot[:-1]) @ odom_T_robot[1:]
+    step = _without_jumps(step, np.diff(streams.odometry_ns) * 1e-9)
+    distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(step[:, :3, 3], axis=1))])
+    overlap = inertial is not None and _overlap(inertial.stamps_ns, streams.odometry_ns) > 0.8
+    if inertial is None or not overlap:
+        T = np.empty((n, 4, 4))
+        T[0] = np.eye(4)
+        for k in range(n - 1):
+            T[k + 1] = T[k] @ step[k]
+        turned = np.concatenate([[0.0], np.cumsum(np.abs(yaw_of(step)))])
+        return Motion(streams.odometry_ns, T, distance, turned, False, True)
+    R_imu = _attitude(inertial, np.interp(inertial.stamps_ns, streams.odometry_ns, _speed(streams, distance)), config)
+    pose = np.tile(np.eye(4), (len(R_imu), 1, 1))
+    pose[:, :3, :3] = R_imu
+    R = interpolate(inertial.stamps_ns, pose, streams.odometry_ns)[:, :3, :3]
+    # Half of the step's turn lies before its middle: the wheels' arc is laid along the gyro's heading.
+    local = step[:, :3, 3]
+    half = exp(0.5 * log(step))[:, :3, :3]
+    straight = (np.swapaxes(half, 1, 2) @ local[:, :, None])[..., 0]
+    middle = interpolate(inertial.stamps_ns, pose, (streams.odometry_ns[:-1] + streams.odometry_ns[1:]) // 2)[:, :3, :3]
+    moves = (middle @ straight[:, :, None])[..., 0]
+    T = np.tile(np.eye(4), (n, 1, 1))
+    T[:, :3, :3] = R
+    T[1:, :3, 3] = np.cumsum(moves, axis=0)
+    turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.unwrap(yaw_of(T)))))])
+    return Motion(streams.odometry_ns, T, distance, turned, True, True)
+
+
+def _overlap(a: Stamps, b: Stamps) -> float:
+    return float(min(a[-1], b[-1]) - max(a[0], b[0])) / max(float(b[-1] - b[0]), 1.0)
+
+
+def _speed(streams: Streams, distance: Array) -> Array:
+    dt = np.gradient(streams.odometry_ns * 1e-9)
+    speed = np.gradient(distance) / np.maximum(dt, 1e-6)
+    return np.asarray(speed * np.where(streams.twist[:, 0] < 0, -1.0, 1.0))
+
+
+def _without_jumps(step: Array, dt: Array) -> Array:
+    """Steps with resets of the odometry (faster than 15 m/s) taken out."""
+    fast = np.linalg.norm(step[:, :3, 3], axis=1) > 15.0 * np.maximum(dt, 0.02) + 0.5
+    step[fast] = np.eye(4)
+    return step
+
+
+def _attitude(inertial: Inertial, speed: Array | None, config: MotionConfig) -> Array:
+    """Rotations odom_R_robot (I, 3, 3): gyro integrated, roll and pitch drawn to gravity."""
+    dt = np.diff(inertial.stamps_ns) * 1e-9
+    rate = inertial.gyro - inertial.gyro_bias
+    force = inertial.accel.copy()
+    if speed is not None:  # take out what the drive itself explains
+        seconds = inertial.stamps_ns * 1e-9
+        force[:, 0] -= np.gradient(speed, seconds - seconds[0])
+        force[:, 1] -= speed * rate[:, 2]
+    first = np.mean(force[: max(5, int(1.0 / max(float(np.median(dt)), 1e-3)))], axis=0)
+    roll, pitch = np.arctan2(first[1], first[2]), np.arctan2(-first[0], np.hypot(first[1], first[2]))
+    q0 = _quaternion_of(float(roll), float(pitch))
+    q = _filter(q0, rate, force, dt.clip(0, 0.2), config.tilt_time_s, GRAVITY)
+    return from_quaternion(np.zeros((len(q), 3)), q)[:, :3, :3]
+
+
+def _quaternion_of(roll: float, pitch: float) -> Array:
+    a, b = roll / 2, pitch / 2
+    return np.array([np.sin(a) * np.cos(b), np.cos(a) * np.sin(b), -np.sin(a) * np.sin(b), np.cos(a) * np.cos(b)])
+
+
+@njit(cache=True)
+def _filter(q0, rate, force, dt, tau, gravity):  # type: ignore[no-untyped-def]
+    n = len(rate)
+    out = np.empty((n, 4))
+    x, y, z, w = q0
+    out[0] = q0
+    for k in range(n - 1):
+        h = dt[k]
+        wx = 0.5 * (rate[k, 0] + rate[k + 1, 0])
+        wy = 0.5 * (rate[k, 1] + rate[k + 1, 1])
+        wz = 0.5 * (rate[k, 2] + rate[k + 1, 2])
+        f = force[k]
+        size = np.sqrt(f[0] ** 2 + f[1] ** 2 + f[2] ** 2)
+        if abs(size - gravity) < 1.5:
+            # Up as the attitude has it, in the body; its cross product with the force turns one onto the other.
+            ux, uy, uz = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+            fx, fy, fz = f[0] / size, f[1] / size, f[2] / size
+            # A turn by up x force would move the body's measured up onto the predicted one.
+            wx += (fy * uz - fz * uy) / tau
+            wy += (fz * ux - fx * uz) / tau
+            wz += (fx * uy - fy * ux) / tau
+        rx, ry, rz = wx * h, wy * h, wz * h
+        a = np.sqrt(rx * rx + ry * ry + rz * rz)
+        s = np.sin(a / 2) / a if a > 1e-12 else 0.5
+        c = np.cos(a / 2)
+        dx, dy, dz = rx * s, ry * s, rz * s
+        x, y, z, w = (
+            w * dx + x * c + y * dz - z * dy,
+            w * dy - x * dz + y * c + z * dx,
+            w * dz + x * dy - y * dx + z * c,
+            w * c - x * dx - y * dy - z * dz,
+        )
+        norm = np.sqrt(x * x + y * y + z * z + w * w)
+        x, y, z, w = x / norm, y / norm, z / norm, w / norm
+        out[k + 1, 0], out[k + 1, 1], out[k + 1, 2], out[k + 1, 3] = x, y, z, w
+    return out

@@ -1,0 +1,123 @@
+"""The small streams of a run as arrays in time order."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from topograph.bags import Fix, Heading, Imu, Odometry
+from topograph.geometry import Array, Stamps, from_quaternion
+
+
+@dataclass(frozen=True, slots=True)
+class Streams:
+    """All of a run but its scans; each block is sorted by stamp and may be empty.
+
+    Attributes:
+        odometry_ns, odom_T_child, twist: (O,), (O, 4, 4), (O, 6) linear (m/s), angular (rad/s).
+        imu_ns, gyro, accel: (I,), (I, 3) rad/s, (I, 3) m/s², in the IMU's frame.
+        fix_ns, lat_lon_h, fix_cov, fix_status: (F,), (F, 3), (F, 3, 3) m², (F,).
+        heading_ns, heading, heading_sigma: (H,), (H,) rad, (H,) rad or NaN.
+        frames: of "child", "imu", "fix" and "heading", as far as there are any.
+    """
+
+    odometry_ns: Stamps
+    odom_T_child: Array
+    twist: Array
+    imu_ns: Stamps
+    gyro: Array
+    accel: Array
+    fix_ns: Stamps
+    lat_lon_h: Array
+    fix_cov: Array
+    fix_status: NDArray[np.int64]
+    heading_ns: Stamps
+    heading: Array
+    heading_sigma: Array
+    frames: dict[str, str]
+
+
+class StreamsBuilder:
+    """Collects messages as they are read; the newest of odometry and IMU are there for deskewing."""
+
+    def __init__(self) -> None:
+        self.odometry: list[Odometry] = []
+        self.imu: list[Imu] = []
+        self.fixes: list[Fix] = []
+        self.headings: list[Heading] = []
+
+    def add(self, message: Odometry | Imu | Fix | Heading) -> None:
+        """Append one message."""
+        if isinstance(message, Imu):
+            self.imu.append(message)
+        elif isinstance(message, Odometry):
+            self.odometry.append(message)
+        elif isinstance(message, Fix):
+            self.fixes.append(message)
+        else:
+            self.headings.append(message)
+
+    def build(self, skipped: Counter[str]) -> Streams:
+        """Arrays in time order; repeated stamps and unusable fixes are dropped and counted."""
+        odometry = _in_order(self.odometry, "odometry", skipped)
+        imu = _in_order(self.imu, "imu", skipped)
+        fixes = [f for f in _in_order(self.fixes, "fix", skipped) if _usable(f, skipped)]
+        headings = _in_order(self.headings, "heading", skipped)
+        pose = np.array([o.odom_T_child for o in odometry]).reshape(-1, 7)
+        frames = {
+            name: products[0].child_frame if isinstance(products[0], Odometry) else products[0].frame
+            for name, products in (("child", odometry), ("imu", imu), ("fix", fixes), ("heading", headings))
+            if products
+        }
+        return Streams(
+            np.array([o.stamp_ns for o in odometry], np.int64),
+            from_quaternion(pose[:, :3], pose[:, 3:]) if len(pose) else np.zeros((0, 4, 4)),
+            np.array([o.twist for o in odometry]).reshape(-1, 6),
+            np.array([m.stamp_ns for m in imu], np.int64),
+            np.array([m.gyro for m in imu]).reshape(-1, 3),
+            np.array([m.accel for m in imu]).reshape(-1, 3),
+            np.array([f.stamp_ns for f in fixes], np.int64),
+            np.array([f.lat_lon_h for f in fixes]).reshape(-1, 3),
+            np.array([f.cov for f in fixes]).reshape(-1, 3, 3),
+            np.array([f.status for f in fixes], np.int64),
+            np.array([h.stamp_ns for h in headings], np.int64),
+            np.array([h.yaw for h in headings]),
+            np.array([h.sigma for h in headings]),
+            frames,
+        )
+
+
+_P = TypeVar("_P", Odometry, Imu, Fix, Heading)
+
+
+def _in_order(products: list[_P], name: str, skipped: Counter[str]) -> list[_P]:
+    ordered = sorted(products, key=lambda p: p.stamp_ns)
+    out: list[_P] = []
+    for p in ordered:
+        if out and p.stamp_ns <= out[-1].stamp_ns:
+            skipped[f"{name}: repeated stamp"] += 1
+            continue
+        out.append(p)
+    return out
+
+
+def _usable(f: Fix, skipped: Counter[str]) -> bool:
+    variance = np.diag(f.cov)
+    lat, lon = f.lat_lon_h[:2]
+    if f.status < 0:
+        skipped["fix: status says no fix"] += 1
+    elif not np.isfinite(f.lat_lon_h).all() or abs(lat) > 90 or abs(lon) > 360:
+        skipped["fix: position not finite"] += 1
+    elif abs(lat) < 1e-9 and abs(lon) < 1e-9:
+        skipped["fix: position is 0, 0"] += 1
+    elif not np.isfinite(variance).all() or (variance < 0).any() or variance[:2].max() > 1e4:
+        skipped["fix: absurd covariance"] += 1
+    elif np.abs(f.cov - np.diag(variance)).max() > 0.999 * variance.max() and variance.max() > 0:
+        skipped["fix: absurd covariance"] += 1
+    else:
+        return True
+    return False

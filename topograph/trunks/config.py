@@ -1,0 +1,39 @@
+"""What counts as a trunk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class TrunksConfig:
+    """The front end; lengths in m.
+
+    Attributes:
+        front_end: "organised" (ours) or "thesis" (Algorithms 1 and 2).
+        nearest, farthest: distances between which trunks are looked for.
+        low, high: heights above ground between which a trunk is traced.
+        reference: height above ground at which the axis is stated.
+        widest, thinnest: diameters of a trunk.
+        prior_diameter, prior_sigma: of trunks too coarsely seen to measure.
+        min_score: log-odds below which a candidate is dropped.
+        recorded_sigma, recorded_growth, recorded_along: first guess of the noise of recorded detections: at the
+            sensor, per metre of range, and along the axis.
+        recorded_reach: recorded detections beyond are left out.
+    """
+
+    front_end: str = "organised"
+    nearest: float = 0.8
+    farthest: float = 30.0
+    low: float = 0.25
+    high: float = 1.7
+    reference: float = 0.8
+    thinnest: float = 0.05
+    widest: float = 0.8
+    prior_diameter: float = 0.25
+    prior_sigma: float = 0.09
+    min_score: float = 0.0
+    recorded_sigma: float = 0.05
+    recorded_growth: float = 0.01
+    recorded_along: float = 0.3
+    recorded_reach: float = 40.0

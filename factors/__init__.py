@@ -12,11 +12,12 @@ from factors.noise import Kernel, gaussian, robust, sigmas
 from factors.odometry import odometry, odometry_2d
 from factors.pose import from_pose3, to_pose3
 from factors.ranging import range_2d
-from factors.trunk import trunk, trunk_2d, trunk_linear, trunk_residual
+from factors.trunk import bearing_basis, trunk, trunk_2d, trunk_linear, trunk_residual, trunks
 
 __all__ = [
     "ImuNoise",
     "Kernel",
+    "bearing_basis",
     "bias_walk",
     "fix",
     "from_pose3",
@@ -35,4 +36,5 @@ __all__ = [
     "trunk_2d",
     "trunk_linear",
     "trunk_residual",
+    "trunks",
 ]

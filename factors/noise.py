@@ -40,6 +40,10 @@ class Kernel:
             return np.where(d * d > k, (2 * k / (k + d * d)) ** 2, 1.0)
         raise ValueError(f"unknown kernel {self.name!r}")
 
+    def estimator(self) -> Any:
+        """GTSAM's m-estimator, or None for "none"."""
+        return None if self.name == "none" else _ESTIMATORS[self.name].Create(self.width)
+
 
 def sigmas(values: ArrayLike) -> Any:
     """Diagonal noise of standard deviations (d,).
@@ -69,6 +73,5 @@ def gaussian(cov: ArrayLike) -> Any:
 
 def robust(model: Any, kernel: Kernel) -> Any:
     """`model` under a robust loss."""
-    if kernel.name == "none":
-        return model
-    return gtsam.noiseModel.Robust.Create(_ESTIMATORS[kernel.name].Create(kernel.width), model)
+    estimator = kernel.estimator()
+    return model if estimator is None else gtsam.noiseModel.Robust.Create(estimator, model)

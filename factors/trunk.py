@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.noise import Kernel, gaussian, robust, sigmas
+from factors.noise import Kernel, robust, sigmas
 
 Array = NDArray[np.float64]
 
@@ -23,17 +23,43 @@ def trunk(pose_key: int, point_key: int, robot_p_trunk: ArrayLike, cov: ArrayLik
     """Bearing and range from a Pose3 to a Point3, of a point (3,) with covariance (3, 3) in the robot's frame, m.
 
     Raises:
-        ValueError: not finite, or nearer than 1 cm.
+        ValueError: not finite, nearer than 1 cm, or a covariance that is not positive definite.
     """
-    p = np.asarray(robot_p_trunk, float)
-    distance = float(np.linalg.norm(p))
-    if not np.isfinite(distance) or distance < 0.01:
+    p = np.asarray(robot_p_trunk, float)[None]
+    return trunks([pose_key], [point_key], p, np.asarray(cov, float)[None], kernel)[0]
+
+
+def trunks(pose_keys: list[int], point_keys: list[int], robot_p_trunk: Array, cov: Array, kernel: Kernel) -> list[Any]:
+    """`trunk` for N sightings at once: points (N, 3), covariances (N, 3, 3); checks and algebra are done in bulk.
+
+    Raises:
+        ValueError: as `trunk`.
+    """
+    distance = np.linalg.norm(robot_p_trunk, axis=1)
+    if not (np.isfinite(distance).all() and (distance >= 0.01).all()):
         raise ValueError("a trunk must be finite and not inside the sensor")
-    bearing = gtsam.Unit3(p)
-    J = np.vstack([np.asarray(bearing.basis()).T / distance, p / distance])
-    return gtsam.BearingRangeFactor3D(
-        pose_key, point_key, bearing, distance, robust(gaussian(J @ np.asarray(cov, float) @ J.T), kernel)
-    )
+    unit = robot_p_trunk / distance[:, None]
+    J = np.concatenate([np.swapaxes(bearing_basis(unit), 1, 2) / distance[:, None, None], unit[:, None, :]], axis=1)
+    turned = J @ cov @ np.swapaxes(J, 1, 2)
+    turned = 0.5 * (turned + np.swapaxes(turned, 1, 2))
+    if not np.isfinite(turned).all() or (len(turned) and np.linalg.eigvalsh(turned)[:, 0].min() <= 0):
+        raise ValueError("a covariance must be finite and positive definite")
+    estimator = kernel.estimator()
+    create, robustly = gtsam.noiseModel.Gaussian.Covariance, gtsam.noiseModel.Robust.Create
+    out = []
+    for k, j, p, r, c in zip(pose_keys, point_keys, robot_p_trunk, distance.tolist(), turned, strict=True):
+        noise = create(c) if estimator is None else robustly(estimator, create(c))
+        out.append(gtsam.BearingRangeFactor3D(k, j, gtsam.Unit3(p), r, noise))
+    return out
+
+
+def bearing_basis(unit: Array) -> Array:
+    """Tangent basis (N, 3, 2) that gtsam.Unit3 uses at directions (N, 3): across the least of the axes."""
+    least = np.abs(unit).argmin(axis=1)
+    first = np.cross(unit, np.eye(3)[least])
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(unit, first)
+    return np.stack([first, second / np.linalg.norm(second, axis=1, keepdims=True)], axis=2)
 
 
 def trunk_2d(pose_key: int, point_key: int, bearing: float, distance: float, sigma: ArrayLike, kernel: Kernel) -> Any:

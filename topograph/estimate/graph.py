@@ -55,7 +55,7 @@ def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False) -> E
     inert = None if quick or not config.use_imu else inertia(problem)
     values = _values(problem, poses, trees, inert)
     first = _Pass(huber, huber, 0.05 if quick else 0.0)
-    values = levenberg_marquardt(_graph(problem, first, config, inert), values, 12 if quick else config.iterations, 1e-4)
+    values = levenberg_marquardt(_graph(problem, first, config, inert), values, 8 if quick else config.iterations, 1e-3 if quick else 1e-4)
     if quick:
         return _estimate(problem, config, values, first, None, time.perf_counter() - began)
     scales = _learned_scales(problem, values, first) if config.learn_scale else (1.0, 1.0)
@@ -109,8 +109,8 @@ def _graph(problem: Problem, p: _Pass, config: EstimateConfig, inert: Inertia | 
     if trunks:
         s = problem.sightings
         cov = p.trunk_scale**2 * s.cov
-        for k, j, z, c in zip(s.keyframe.tolist(), s.tree.tolist(), s.p, cov, strict=True):
-            g.add(factors.trunk(X + k, L + j, z, c, p.trunk))
+        for f in factors.trunks((X + s.keyframe).tolist(), (L + s.tree).tolist(), s.p, cov, p.trunk):
+            g.add(f)
         _add_tree_priors(g, problem)
     return g
 
@@ -165,9 +165,8 @@ def _add_fixes(g: Any, problem: Problem, p: _Pass, config: EstimateConfig) -> No
 
 def _fix_cov(problem: Problem, p: _Pass, config: EstimateConfig) -> Array:
     f = problem.fixes
-    h, v = (max(a, p.fix_floor) for a in config.fix_floor)
-    floor = np.diag([h, h, max(v, p.fix_floor)]) ** 2
-    return np.asarray(p.fix_scale**2 * f.cov + floor)
+    del config
+    return np.asarray(p.fix_scale**2 * f.cov + p.fix_floor**2 * np.eye(3))
 
 
 def _median_trees(problem: Problem, poses: Array) -> Array:
@@ -221,7 +220,7 @@ def _learned_scales(problem: Problem, values: Any, p: _Pass) -> tuple[float, flo
     s = problem.sightings
     if len(e) > 30:
         norm = np.linalg.norm(e, axis=1)
-        trunk = float(np.clip(np.median(norm) / 1.538, 0.4, 6.0))  # median of a chi with 3 dof
+        trunk = float(np.clip(np.median(norm) / 1.538, 0.2, 6.0))  # median of a chi with 3 dof
         order = np.lexsort((s.keyframe, s.tree))
         next_to = (np.diff(s.tree[order]) == 0) & (np.diff(s.keyframe[order]) <= 2)
         a, b = e[order][:-1][next_to], e[order][1:][next_to]

@@ -95,7 +95,7 @@ class LoopCloser:
             self.tree[self.tree == here_id[i]] = there_id[j]
         self.anchored = self.at
         self.loops += 1
-        return moved > 0.15
+        return moved > 0.4
 
 
 def _centres(t: TrackTable, tree: NDArray[np.int64], chosen: NDArray[np.bool_]) -> tuple[Array, NDArray[np.int64], Array]:
@@ -118,7 +118,8 @@ def lay(
     if len(near) == 0:
         return None
     target, target_sigma = there[near], there_sigma[near]
-    moves = _seeds(here, target, centre, sigma, yaw_sigma)
+    # Where dead reckoning is better than the trees are apart, there is one place to try.
+    moves = np.zeros((1, 3)) if sigma < 0.6 else _seeds(here, target, centre, sigma, yaw_sigma)
     tree = cKDTree(target)
     area = np.prod(np.ptp(np.concatenate([here, target]), axis=0) + 10.0)
     density = max(len(target) / area, 1e-4)

@@ -1,0 +1,192 @@
+"""A chain of runs -> the trunk's axis, diameter and covariance, and the features that tell trees from other things."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from topograph.trunks.ground import HALF, ground_at
+from topograph.trunks.runs import COUNT, FIRST, FREE, HEIGHT, LAST, PX, PY, PZ, RANGE, RING, WIDTH
+
+FEATURES = (
+    "range", "rings", "points", "diameter", "width_spread", "rough", "line_rms", "lean", "free", "lowest", "highest",
+    "canopy", "undergrowth", "top_visible", "fill", "taper", "depth_slope", "ring_gap",
+)  # fmt: skip
+OUT_SIZE = 16
+"""x, y, z, axis (3), diameter, height, radial and tangential sigma, lean sigma, points, rings, range, bearing x, y."""
+
+
+@njit(cache=True)
+def fit_chains(p, r, h, runs, chain, plane, grid, above, beside, eye, step, top, reference, prior_d, prior_s, thinnest, widest):  # type: ignore[no-untyped-def]
+    """Trunks (C, OUT_SIZE), features (C, len(FEATURES)) and the chain (C,) that each came from.
+
+    The mean return of a cylinder of radius R lies π/4·R before its axis; R comes from the width of all rings
+    together. So every point helps to place the axis, and no free circle is fitted (a free fit is worse than the
+    centroid at 3 cm of noise).
+    """
+    k = runs.shape[0]
+    out = np.empty((k, OUT_SIZE))
+    feature = np.empty((k, 18))
+    name = np.empty(k, np.int64)
+    n_out = 0
+    members = np.empty(k, np.int64)
+    for c in range(k):
+        if chain[c] != c:
+            continue
+        n, points = 0, 0.0
+        for i in range(c, k):
+            if chain[i] == c:
+                members[n] = i
+                n += 1
+                points += runs[i, COUNT]
+        if points < 3 or (n == 1 and points < 4):
+            continue
+        # Diameter: what n firings cover, less what the beam's own width adds; pooled over the rings.
+        far = 0.0
+        for q in range(n):
+            far += runs[members[q], RANGE] * runs[members[q], COUNT]
+        far /= points
+        widths = np.empty(n)
+        for q in range(n):
+            widths[q] = runs[members[q], COUNT] * step * runs[members[q], RANGE]
+        middle = np.median(widths)
+        ws, w2, wn = 0.0, 0.0, 0.0
+        for q in range(n):
+            if abs(widths[q] - middle) < 0.5 * middle + step * far:
+                ws += widths[q]
+                w2 += widths[q] ** 2
+                wn += 1.0
+        mean_width = ws / max(wn, 1.0)
+        spread = np.sqrt(max(w2 / max(wn, 1.0) - mean_width**2, 0.0))
+        sigma_w = np.sqrt((0.45 * step * far) ** 2 + 0.03**2) / np.sqrt(max(wn, 1.0)) + 0.012
+        measured = mean_width - 0.0012 * far
+        gain = prior_s**2 / (prior_s**2 + sigma_w**2)
+        diameter = prior_d + gain * (measured - prior_d)
+        if measured > widest or measured < -0.5:
+            continue
+        diameter = min(max(diameter, thinnest), widest)
+        sigma_d = np.sqrt(gain) * sigma_w
+        radius = 0.5 * diameter
+        # Ring centres on the axis, then a line through them; lean is held by a prior.
+        cx, cy, cz, cw = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+        for q in range(n):
+            i = members[q]
+            dx, dy = runs[i, PX] - eye[0], runs[i, PY] - eye[1]
+            d = np.sqrt(dx * dx + dy * dy)
+            push = 0.785 * radius
+            cx[q], cy[q], cz[q] = runs[i, PX] + dx / d * push, runs[i, PY] + dy / d * push, runs[i, PZ]
+            # A ring that is much wider or narrower than the others is partly hidden, or not only trunk.
+            odd = (widths[q] - mean_width) / (0.05 + step * far)
+            cw[q] = min(runs[i, COUNT], 12.0) / (1.0 + odd * odd)
+        x0, y0, lx, ly = 0.0, 0.0, 0.0, 0.0
+        zm, wsum = 0.0, 0.0
+        lean_precision = 0.0
+        for turn in range(3):
+            wsum, zm, xm, ym = 0.0, 0.0, 0.0, 0.0
+            for q in range(n):
+                wsum += cw[q]
+                zm += cw[q] * cz[q]
+                xm += cw[q] * cx[q]
+                ym += cw[q] * cy[q]
+            zm, xm, ym = zm / wsum, xm / wsum, ym / wsum
+            szz, szx, szy = 0.0, 0.0, 0.0
+            for q in range(n):
+                dz = cz[q] - zm
+                szz += cw[q] * dz * dz
+                szx += cw[q] * dz * (cx[q] - xm)
+                szy += cw[q] * dz * (cy[q] - ym)
+            noise = 0.035**2 * 6.0  # of one ring's centre, in the units of the weights
+            lean_precision = szz + noise / 0.14**2
+            lx, ly = szx / lean_precision, szy / lean_precision
+            x0, y0 = xm, ym
+            if turn < 2:
+                for q in range(n):
+                    ex = cx[q] - x0 - lx * (cz[q] - zm)
+                    ey = cy[q] - y0 - ly * (cz[q] - zm)
+                    e2 = (ex * ex + ey * ey) / 0.06**2
+                    cw[q] = cw[q] / (1.0 + e2) if turn == 0 else cw[q]
+        line2, rough2, rough_n = 0.0, 0.0, 0.0
+        lowest, highest, free = 1e9, -1e9, 0.0
+        for q in range(n):
+            i = members[q]
+            ex = cx[q] - x0 - lx * (cz[q] - zm)
+            ey = cy[q] - y0 - ly * (cz[q] - zm)
+            line2 += ex * ex + ey * ey
+            lowest, highest = min(lowest, runs[i, HEIGHT]), max(highest, runs[i, HEIGHT])
+            free += runs[i, FREE]
+            for m in range(int(runs[i, FIRST]), int(runs[i, LAST]) + 1):
+                ax, ay = x0 + lx * (p[m, 2] - zm), y0 + ly * (p[m, 2] - zm)
+                dx, dy = p[m, 0] - ax, p[m, 1] - ay
+                rough2 += (np.sqrt(dx * dx + dy * dy) - radius) ** 2
+                rough_n += 1.0
+        ground = ground_at(x0, y0, plane, grid)
+        z_ref = ground + reference
+        # Beyond the rings seen the axis is not known better than its lean.
+        z_at = min(max(z_ref, zm - 1.2), zm + 1.2)
+        px, py = x0 + lx * (z_at - zm), y0 + ly * (z_at - zm)
+        size = np.sqrt(lx * lx + ly * ly + 1.0)
+        lean_var = noise / lean_precision
+        lever2 = (z_at - zm) ** 2 * lean_var
+        radial = np.sqrt(0.035**2 / points + (0.785 * 0.5 * sigma_d) ** 2 + lever2 + 0.012**2)
+        tangential = np.sqrt((0.3 * step * far) ** 2 / n + 0.02**2 / n + lever2 + 0.012**2)
+        row = out[n_out]
+        row[0], row[1], row[2] = px, py, z_at
+        row[3], row[4], row[5] = lx / size, ly / size, 1.0 / size
+        row[6], row[7] = diameter, z_at - ground
+        row[8], row[9], row[10] = radial, tangential, np.sqrt(lean_var)
+        row[11], row[12], row[13] = points, n, far
+        d = np.sqrt((px - eye[0]) ** 2 + (py - eye[1]) ** 2)
+        row[14], row[15] = (px - eye[0]) / d, (py - eye[1]) / d
+        # Features.
+        gx, gy = int(np.floor(px - 0.5)) + HALF, int(np.floor(py - 0.5)) + HALF
+        canopy, under = 0, 0
+        for a in range(gx, gx + 2):
+            for b in range(gy, gy + 2):
+                if 0 <= a < 2 * HALF and 0 <= b < 2 * HALF:
+                    canopy += above[a, b]
+                    under += beside[a, b]
+        f = feature[n_out]
+        seen_top = eye[2] + d * np.tan(top) - ground
+        upper, lower, nu, nl = 0.0, 0.0, 0.0, 0.0
+        for q in range(n):
+            if cz[q] > zm:
+                upper += widths[q]
+                nu += 1.0
+            else:
+                lower += widths[q]
+                nl += 1.0
+        first, last = members[0], members[n - 1]
+        f[0], f[1], f[2] = np.log(far), np.log(n), np.log(points)
+        f[3], f[4] = measured, spread
+        f[5] = np.sqrt(rough2 / max(rough_n, 1.0))
+        f[6] = np.sqrt(line2 / n)
+        f[7] = np.sqrt(lx * lx + ly * ly)
+        f[8] = free / (2.0 * n)
+        f[9], f[10] = lowest, highest
+        f[11], f[12] = np.log(1.0 + canopy), np.log(1.0 + max(under - points, 0.0))
+        f[13] = min(seen_top, 5.0)
+        f[14] = points * step * far / max(n * measured, 0.03)
+        f[15] = (upper / nu - lower / nl) if nu > 0 and nl > 0 else 0.0
+        f[16] = (runs[last, RANGE] - runs[first, RANGE]) / max(highest - lowest, 0.3)
+        f[17] = (runs[last, RING] - runs[first, RING] + 1.0) / n
+        name[n_out] = c
+        n_out += 1
+    return out[:n_out], feature[:n_out], name[:n_out]
+
+
+@njit(cache=True)
+def suppress(out, score, distance):  # type: ignore[no-untyped-def]
+    """Group (C,) of each trunk: those within `distance` m of a better one are its stems or its pieces."""
+    n = out.shape[0]
+    group = np.full(n, -1, np.int64)
+    order = np.argsort(-score)
+    for a in range(n):
+        i = order[a]
+        if group[i] >= 0:
+            continue
+        group[i] = i
+        for b in range(a + 1, n):
+            j = order[b]
+            if group[j] < 0 and (out[i, 0] - out[j, 0]) ** 2 + (out[i, 1] - out[j, 1]) ** 2 < distance * distance:
+                group[j] = i
+    return group

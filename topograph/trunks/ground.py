@@ -1,0 +1,117 @@
+"""The ground under a sweep: a robust plane and the grid of what the ground differs from it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+HALF = 32
+"""Cells of 1 m in each direction from the base."""
+
+
+@njit(cache=True)
+def fit_ground(p):  # type: ignore[no-untyped-def]
+    """Plane (3,) z = a + b x + c y, and residual heights (2·HALF, 2·HALF) on 1 m cells, all in the base's frame, m.
+
+    Lowest points of cells vote; a cell that stands above its neighbours shows a thing, not the ground. Gaps are
+    filled by diffusion, towards the plane where nothing is near.
+    """
+    size = 2 * HALF
+    low = np.full((size, size), 1e9, np.float32)
+    for i in range(p.shape[0]):
+        x, y = int(np.floor(p[i, 0])) + HALF, int(np.floor(p[i, 1])) + HALF
+        if 0 <= x < size and 0 <= y < size and p[i, 2] < low[x, y]:
+            low[x, y] = p[i, 2]
+    xs = np.empty(size * size)
+    ys, zs = np.empty(size * size), np.empty(size * size)
+    n = 0
+    for i in range(size):
+        for j in range(size):
+            x, y = i - HALF + 0.5, j - HALF + 0.5
+            if low[i, j] < 1e8 and x * x + y * y < 225.0:
+                xs[n], ys[n], zs[n] = x, y, low[i, j]
+                n += 1
+    plane = np.zeros(3)
+    grid = np.zeros((size, size), np.float32)
+    if n < 6:
+        return plane, grid
+    near = np.empty(n)
+    m = 0
+    for k in range(n):
+        if xs[k] ** 2 + ys[k] ** 2 < 49.0:
+            near[m] = zs[k]
+            m += 1
+    plane[0] = np.percentile(near[:m], 25) if m > 5 else np.percentile(zs[:n], 15)
+    for turn in range(12):
+        s = np.zeros((3, 3))
+        v = np.zeros(3)
+        width = 0.6 if turn < 4 else 0.25
+        for k in range(n):
+            e = zs[k] - plane[0] - plane[1] * xs[k] - plane[2] * ys[k]
+            w = 1.0 / (1.0 + (e / width) ** 2) ** 2 if e < 0 else 1.0 / (1.0 + (2.0 * e / width) ** 2) ** 2
+            w /= 1.0 + 0.01 * (xs[k] ** 2 + ys[k] ** 2)
+            s[0, 0] += w
+            s[0, 1] += w * xs[k]
+            s[0, 2] += w * ys[k]
+            s[1, 1] += w * xs[k] * xs[k]
+            s[1, 2] += w * xs[k] * ys[k]
+            s[2, 2] += w * ys[k] * ys[k]
+            v[0] += w * zs[k]
+            v[1] += w * zs[k] * xs[k]
+            v[2] += w * zs[k] * ys[k]
+        s[1, 0], s[2, 0], s[2, 1] = s[0, 1], s[0, 2], s[1, 2]
+        s[1, 1] += 1.0  # a weak pull to level: a few cells in a row fix no slope
+        s[2, 2] += 1.0
+        s[0, 0] += 1e-9
+        plane = np.linalg.solve(s, v)
+    valid = np.zeros((size, size), np.bool_)
+    for i in range(size):
+        for j in range(size):
+            if low[i, j] < 1e8:
+                x, y = i - HALF + 0.5, j - HALF + 0.5
+                e = low[i, j] - plane[0] - plane[1] * x - plane[2] * y
+                bound = 0.4 + 0.035 * np.sqrt(x * x + y * y)
+                if -bound - 0.3 < e < bound:
+                    grid[i, j] = e
+                    valid[i, j] = True
+    # A cell much above a neighbour shows a thing; drop it.
+    for _ in range(2):
+        for i in range(1, size - 1):
+            for j in range(1, size - 1):
+                if not valid[i, j]:
+                    continue
+                least = 1e9
+                for di in range(-2, 3):
+                    for dj in range(-2, 3):
+                        a, b = i + di, j + dj
+                        if 0 <= a < size and 0 <= b < size and valid[a, b]:
+                            g = grid[a, b] + 0.12 * np.sqrt(di * di + dj * dj)
+                            if g < least:
+                                least = g
+                if grid[i, j] > least + 0.12:
+                    valid[i, j] = False
+    for i in range(size):
+        for j in range(size):
+            if not valid[i, j]:
+                grid[i, j] = 0.0
+    for _ in range(16):
+        for i in range(1, size - 1):
+            for j in range(1, size - 1):
+                around = 0.25 * (grid[i - 1, j] + grid[i + 1, j] + grid[i, j - 1] + grid[i, j + 1])
+                if valid[i, j]:
+                    grid[i, j] = 0.75 * grid[i, j] + 0.25 * around
+                else:
+                    grid[i, j] = 0.985 * around
+    return plane, grid
+
+
+@njit(cache=True)
+def ground_at(x, y, plane, grid):  # type: ignore[no-untyped-def]
+    """Ground height at a position in the base's frame, bilinear between cell centres."""
+    u, v = x + HALF - 0.5, y + HALF - 0.5
+    i, j = int(np.floor(u)), int(np.floor(v))
+    z = plane[0] + plane[1] * x + plane[2] * y
+    if i < 0 or j < 0 or i > 2 * HALF - 2 or j > 2 * HALF - 2:
+        return z
+    a, b = u - i, v - j
+    return z + (1 - a) * ((1 - b) * grid[i, j] + b * grid[i, j + 1]) + a * ((1 - b) * grid[i + 1, j] + b * grid[i + 1, j + 1])

@@ -9,8 +9,8 @@ from factors.ground import level
 from factors.heading import heading
 from factors.imu import ImuNoise, bias_walk, preintegrate, preintegrated
 from factors.noise import Kernel, gaussian, robust, sigmas
-from factors.odometry import odometry, odometry_2d
-from factors.pose import from_pose3, to_pose3
+from factors.odometry import odometries, odometry, odometry_2d
+from factors.pose import from_pose3, to_pose3, to_pose3s
 from factors.ranging import range_2d
 from factors.trunk import bearing_basis, trunk, trunk_2d, trunk_linear, trunk_residual, trunks
 
@@ -24,6 +24,7 @@ __all__ = [
     "gaussian",
     "heading",
     "level",
+    "odometries",
     "odometry",
     "odometry_2d",
     "preintegrate",
@@ -32,6 +33,7 @@ __all__ = [
     "robust",
     "sigmas",
     "to_pose3",
+    "to_pose3s",
     "trunk",
     "trunk_2d",
     "trunk_linear",

@@ -22,6 +22,20 @@ def to_pose3(pose: ArrayLike) -> Any:
     return gtsam.Pose3(gtsam.Rot3(R), T[:3, 3])
 
 
+def to_pose3s(poses: NDArray[np.float64]) -> list[Any]:
+    """gtsam.Pose3 of matrices (N, 4, 4), checked in bulk.
+
+    Raises:
+        ValueError: as `to_pose3`.
+    """
+    R, t = poses[:, :3, :3], poses[:, :3, 3]
+    if not np.isfinite(poses).all() or np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(initial=0.0) > 1e-6:
+        raise ValueError("not rigid motions")
+    if len(R) and np.linalg.det(R).min() < 0:
+        raise ValueError("not rigid motions")
+    return [gtsam.Pose3(gtsam.Rot3(a), b) for a, b in zip(R, t, strict=True)]
+
+
 def from_pose3(pose: Any) -> NDArray[np.float64]:
     """Matrix (4, 4) of a gtsam.Pose3."""
     return np.asarray(pose.matrix())

@@ -61,7 +61,8 @@ def collect(folder: Path, every: int):
                 j = distance.argmin(axis=1)
                 k = np.arange(len(j))
                 near = distance[k, j]
-                label = near < 0.35 + 0.15 * (truth.stems[j] > 1)
+                many = truth.stems[j] > 1
+                label = np.where(near < np.where(many, 0.35, 0.15), 1.0, np.where(near < 0.45, np.nan, 0.0))
                 e = d[k, j]
                 line = c.fits[:, 14:16]
                 radial = np.sum(e * line, axis=1)
@@ -71,7 +72,7 @@ def collect(folder: Path, every: int):
                 y.append(label)
                 fits.append(c.fits)
         print(bag.name, sum(map(len, y)), flush=True)
-    return np.concatenate(X), np.concatenate(y).astype(float), np.concatenate(fits), np.concatenate(errors)
+    return np.concatenate(X), np.concatenate(y), np.concatenate(fits), np.concatenate(errors)
 
 
 def unpack(w, f):
@@ -102,6 +103,8 @@ def train(X, y, ridge=2e-4):
 def main(train_dir: Path, validation_dir: Path) -> None:
     X, y, fits, errors = collect(train_dir, 4)
     mean, deviation = X.mean(0), X.std(0) + 1e-6
+    sure = np.isfinite(y)  # pieces beside a trunk are neither
+    X, y, fits, errors = X[sure], y[sure], fits[sure], errors[sure]
     (w1, b1, w2, b2), fun = train(np.clip((X - mean) / deviation, -4, 4), y)
     print(f"train: {len(y)} candidates, {y.mean():.2f} trees, loss {fun:.3f}")
 
@@ -109,6 +112,10 @@ def main(train_dir: Path, validation_dir: Path) -> None:
         return (np.tanh(np.clip((F - mean) / deviation, -4, 4) @ w1 + b1) @ w2 + b2)[:, 0]
 
     z = score(X)
+    one = (y > 0) & (z > 0) & (errors[:, 2] == 1) & (X[:, 2] > np.log(6))
+    A = np.stack([X[one, 3], 0.003475 * fits[one, 13], np.ones(one.sum())], 1)
+    print("diameter = a width + b step·range + c:", np.linalg.lstsq(A, fits[one, 6] - errors[one, 3], rcond=None)[0].round(3),
+          "bias", (X[one, 3] - fits[one, 6] + errors[one, 3]).mean().round(4))
     good = (y > 0) & (z > 0) & (errors[:, 2] == 1)
     cls = np.searchsorted(RANGE_EDGES, fits[:, 13])
     factor = np.ones((2, 4))
@@ -130,7 +137,8 @@ def main(train_dir: Path, validation_dir: Path) -> None:
                 radial_factor=factor[0], tangential_factor=factor[1]).items()},
     }  # fmt: skip
     out.write_text(json.dumps(data) + "\n")
-    Xv, yv, fv, ev = collect(validation_dir, 4)
+    Xv, yv, _, _ = collect(validation_dir, 4)
+    Xv, yv = Xv[np.isfinite(yv)], yv[np.isfinite(yv)]
     zv = score(Xv)
     for name, z_, y_ in (("train", z, y), ("validation", zv, yv)):
         p = z_ > 0

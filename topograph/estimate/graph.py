@@ -77,8 +77,8 @@ def _poses_alone(problem: Problem, poses: Array, config: EstimateConfig) -> Arra
 
 def _values(problem: Problem, poses: Array, trees: Array, inert: Inertia | None) -> Any:
     values = gtsam.Values()
-    for k, T in enumerate(poses):
-        values.insert(X + k, factors.to_pose3(_orthonormal(T)))
+    for k, T in enumerate(factors.to_pose3s(_orthonormal(poses))):
+        values.insert(X + k, T)
     for j, p in enumerate(trees):
         values.insert(L + j, p)
     if inert is not None:
@@ -91,10 +91,11 @@ def _values(problem: Problem, poses: Array, trees: Array, inert: Inertia | None)
     return values
 
 
-def _orthonormal(T: Array) -> Array:
-    U, _, Vt = np.linalg.svd(T[:3, :3])
-    out = T.copy()
-    out[:3, :3] = U @ Vt
+def _orthonormal(poses: Array) -> Array:
+    """Poses (..., 4, 4) with rounding taken out of their rotations."""
+    U, _, Vt = np.linalg.svd(poses[..., :3, :3])
+    out = poses.copy()
+    out[..., :3, :3] = U @ Vt
     return out
 
 
@@ -137,8 +138,8 @@ def _add_motion(g: Any, problem: Problem, inert: Inertia | None) -> None:
     if inert is not None:  # the gyro speaks through its own factor
         covered = ~np.array([f is None for f in inert.preintegrated])
         sigma[covered, :3] = np.maximum(5.0 * sigma[covered, :3], 0.05)
-    for k in range(n - 1):
-        g.add(factors.odometry(X + k, X + k + 1, step[k], sigma[k]))
+    for f in factors.odometries([X + k for k in range(n)], _orthonormal(step), sigma):
+        g.add(f)
     georeferenced = len(problem.fixes.keyframe) >= 3
     first = factors.to_pose3(_orthonormal(problem.start[0] if problem.start is not None else problem.odom_T_robot[0]))
     loose = [10.0, 10.0, 10.0, 1e4, 1e4, 1e4] if georeferenced else [0.03, 0.03, 1e-3, 1e-3, 1e-3, 1e-3]

@@ -1,5 +1,8 @@
-from dataclasses import dataclass
-@dataclass(frozen=True, slots=True)
-class TopomapConfig:
-    """x"""
-    x: int = 0
+"""Estimate + scans -> TopoMap: nodes with viewpoint clouds, edges, rows. No solver, no files."""
+
+from topograph.topomap.build import build
+from topograph.topomap.edges import TopomapConfig, neighbours
+from topograph.topomap.map import TopoMap, Viewpoint
+from topograph.topomap.rows import find_rows
+
+__all__ = ["TopoMap", "TopomapConfig", "Viewpoint", "build", "find_rows", "neighbours"]

@@ -15,7 +15,7 @@ from topograph.trunks.config import TrunksConfig
 from topograph.trunks.fit import fit_chains, suppress
 from topograph.trunks.ground import fit_ground
 from topograph.trunks.organise import angular_step, organise, rings_of
-from topograph.trunks.runs import COUNT, FIRST, find_runs, heights, link
+from topograph.trunks.runs import FIRST, LAST, find_runs, heights, link
 
 RANGE_EDGES = (5.0, 10.0, 20.0)
 _NO_TIME = np.zeros(0, np.float32)
@@ -53,11 +53,11 @@ def candidates(scan: Scan, base_T_lidar: Array, twist: Array, config: TrunksConf
     step = angular_step(a, starts)
     plane, grid = fit_ground(p)
     h, above, beside = heights(p, plane, grid)
-    runs = find_runs(p, r, a, h, starts, step, config.low, config.high, config.widest)
+    runs, label = find_runs(p, r, a, h, starts, step, config.low, config.high, config.widest)
     chain = link(runs)
     top = _top(scan, n_rings)
     fits, features, name = fit_chains(
-        p, r, h, runs, chain, plane, grid, above, beside, base_T_lidar[:3, 3].copy(), step, top, config.reference,
+        p, r, h, runs, label, chain, plane, grid, above, beside, base_T_lidar[:3, 3].copy(), step, top, config.reference,
         config.prior_diameter, config.prior_sigma, config.thinnest, config.widest,
     )  # fmt: skip
     near = fits[:, 13] < config.farthest
@@ -65,9 +65,9 @@ def candidates(scan: Scan, base_T_lidar: Array, twist: Array, config: TrunksConf
     order = np.argsort(chain, kind="stable")
     lo = np.searchsorted(chain[order], name)
     hi = np.searchsorted(chain[order], name, side="right")
-    first, count = runs[:, FIRST].astype(np.int64), runs[:, COUNT].astype(np.int64)
+    first, last = runs[:, FIRST].astype(np.int64).tolist(), runs[:, LAST].astype(np.int64).tolist()
     members = [
-        np.concatenate([np.arange(first[i], first[i] + count[i]) for i in order[b:e].tolist()])
+        np.concatenate([first[i] + np.flatnonzero(label[first[i] : last[i] + 1] == i) for i in order[b:e].tolist()])
         for b, e in zip(lo.tolist(), hi.tolist(), strict=True)
     ]
     return Candidates(fits, features, p, members)

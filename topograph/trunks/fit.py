@@ -17,7 +17,7 @@ OUT_SIZE = 16
 
 
 @njit(cache=True)
-def fit_chains(p, r, h, runs, chain, plane, grid, above, beside, eye, step, top, reference, prior_d, prior_s, thinnest, widest):  # type: ignore[no-untyped-def]
+def fit_chains(p, r, h, runs, label, chain, plane, grid, above, beside, eye, step, top, reference, prior_d, prior_s, thinnest, widest):  # type: ignore[no-untyped-def]
     """Trunks (C, OUT_SIZE), features (C, len(FEATURES)) and the chain (C,) that each came from.
 
     The mean return of a cylinder of radius R lies π/4·R before its axis; R comes from the width of all rings
@@ -48,7 +48,7 @@ def fit_chains(p, r, h, runs, chain, plane, grid, above, beside, eye, step, top,
         far /= points
         widths = np.empty(n)
         for q in range(n):
-            widths[q] = runs[members[q], COUNT] * step * runs[members[q], RANGE]
+            widths[q] = runs[members[q], WIDTH]
         middle = np.median(widths)
         ws, w2, wn = 0.0, 0.0, 0.0
         for q in range(n):
@@ -59,7 +59,7 @@ def fit_chains(p, r, h, runs, chain, plane, grid, above, beside, eye, step, top,
         mean_width = ws / max(wn, 1.0)
         spread = np.sqrt(max(w2 / max(wn, 1.0) - mean_width**2, 0.0))
         sigma_w = np.sqrt((0.45 * step * far) ** 2 + 0.03**2) / np.sqrt(max(wn, 1.0)) + 0.012
-        measured = mean_width - 0.0012 * far
+        measured = mean_width
         gain = prior_s**2 / (prior_s**2 + sigma_w**2)
         diameter = prior_d + gain * (measured - prior_d)
         if measured > widest or measured < -0.5:
@@ -73,7 +73,7 @@ def fit_chains(p, r, h, runs, chain, plane, grid, above, beside, eye, step, top,
             i = members[q]
             dx, dy = runs[i, PX] - eye[0], runs[i, PY] - eye[1]
             d = np.sqrt(dx * dx + dy * dy)
-            push = 0.785 * radius
+            push = 0.83 * radius  # π/4, and the edges that mixed pixels take away
             cx[q], cy[q], cz[q] = runs[i, PX] + dx / d * push, runs[i, PY] + dy / d * push, runs[i, PZ]
             # A ring that is much wider or narrower than the others is partly hidden, or not only trunk.
             odd = (widths[q] - mean_width) / (0.05 + step * far)
@@ -115,6 +115,8 @@ def fit_chains(p, r, h, runs, chain, plane, grid, above, beside, eye, step, top,
             lowest, highest = min(lowest, runs[i, HEIGHT]), max(highest, runs[i, HEIGHT])
             free += runs[i, FREE]
             for m in range(int(runs[i, FIRST]), int(runs[i, LAST]) + 1):
+                if label[m] != i:
+                    continue
                 ax, ay = x0 + lx * (p[m, 2] - zm), y0 + ly * (p[m, 2] - zm)
                 dx, dy = p[m, 0] - ax, p[m, 1] - ay
                 rough2 += (np.sqrt(dx * dx + dy * dy) - radius) ** 2

@@ -34,49 +34,60 @@ def heights(p, plane, grid):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def find_runs(p, r, a, h, starts, step, low, high, widest):  # type: ignore[no-untyped-def]
-    """Runs (K, RUN_SIZE): first and last point, ring, mean xyz (m), mean range, width, free sides, height, count, bearing."""
+    """Runs (K, RUN_SIZE) and the run (M,) of each point or -1.
+
+    Columns: first and last point, ring, mean xyz (m), mean range, width, free sides, height, count, bearing. A leaf
+    before a trunk does not end its run: up to three strange returns are passed over.
+    """
     n_rings = starts.shape[0] - 1
-    out = np.empty((max(p.shape[0] // 2, 1), RUN_SIZE), np.float64)
+    m = p.shape[0]
+    out = np.empty((max(m // 2, 1), RUN_SIZE), np.float64)
+    label = np.full(m, -1, np.int64)
     k = 0
     for ring in range(n_rings):
         lo, hi = starts[ring], starts[ring + 1]
-        i = lo
-        while i < hi:
-            if not (low < h[i] < high):
-                i += 1
+        for i in range(lo, hi):
+            if label[i] >= 0 or not (low < h[i] < high):
                 continue
-            j = i
-            while j + 1 < hi and low < h[j + 1] < high:
-                gap = abs(a[j + 1] - a[j])
-                if gap > 3.2 * step or abs(r[j + 1] - r[j]) > 0.16 + 0.003 * r[j]:
-                    break
+            bound = 0.13 + 0.003 * r[i]
+            n, last = 1, i
+            label[i] = k
+            sx, sy, sz = float(p[i, 0]), float(p[i, 1]), float(p[i, 2])
+            sr, sh, sa = float(r[i]), float(h[i]), float(a[i])
+            recent = float(r[i])
+            j = i + 1
+            while j < hi and abs(a[j] - a[last]) < max(4.2 * step, 0.1 / r[i]):
+                if label[j] < 0 and low < h[j] < high and abs(r[j] - recent) < bound:
+                    label[j] = k
+                    last = j
+                    n += 1
+                    recent += 0.4 * (r[j] - recent)  # noise must not end a run that bends
+                    sx += p[j, 0]
+                    sy += p[j, 1]
+                    sz += p[j, 2]
+                    sr += r[j]
+                    sh += h[j]
+                    sa += a[j]
                 j += 1
-            n = j - i + 1
-            width = (abs(a[j] - a[i]) + step) * r[i]
-            if n >= 2 and width < 1.6 * widest and k < out.shape[0]:
-                sx = sy = sz = sr = sh = sa = 0.0
-                for q in range(i, j + 1):
-                    sx += p[q, 0]
-                    sy += p[q, 1]
-                    sz += p[q, 2]
-                    sr += r[q]
-                    sh += h[q]
-                    sa += a[q]
-                # A side is free when what is seen beside the run lies behind it (or is nothing).
-                free = 0.0
-                mean = sr / n
-                if i == lo or abs(a[i] - a[i - 1]) > 3.2 * step or r[i - 1] > mean + 0.3:
-                    free += 1.0
-                if j == hi - 1 or abs(a[j + 1] - a[j]) > 3.2 * step or r[j + 1] > mean + 0.3:
-                    free += 1.0
-                row = out[k]
-                row[FIRST], row[LAST], row[RING] = i, j, ring
-                row[PX], row[PY], row[PZ] = sx / n, sy / n, sz / n
-                row[RANGE], row[WIDTH], row[FREE] = mean, width, free
-                row[HEIGHT], row[COUNT], row[BEARING] = sh / n, n, sa / n
-                k += 1
-            i = j + 1
-    return out[:k]
+            width = (abs(a[last] - a[i]) + step) * r[i]
+            if n < 2 or width > 1.6 * widest or n < 0.4 * width / (step * r[i]) or k >= out.shape[0]:
+                for j in range(i, last + 1):
+                    if label[j] == k:
+                        label[j] = -2
+                continue
+            # A side is free when what is seen beside the run lies behind it (or is nothing).
+            mean, free = sr / n, 0.0
+            if i == lo or abs(a[i] - a[i - 1]) > 3.2 * step or r[i - 1] > mean + 0.3:
+                free += 1.0
+            if last == hi - 1 or abs(a[last + 1] - a[last]) > 3.2 * step or r[last + 1] > mean + 0.3:
+                free += 1.0
+            row = out[k]
+            row[FIRST], row[LAST], row[RING] = i, last, ring
+            row[PX], row[PY], row[PZ] = sx / n, sy / n, sz / n
+            row[RANGE], row[WIDTH], row[FREE] = mean, width, free
+            row[HEIGHT], row[COUNT], row[BEARING] = sh / n, n, sa / n
+            k += 1
+    return out[:k], label
 
 
 @njit(cache=True)

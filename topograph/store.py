@@ -1,0 +1,235 @@
+"""TopoMap <-> one OGC GeoPackage, which QGIS opens as it is. Written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from topograph.errors import MapError
+from topograph.geometry import Array, Datum, from_quaternion, to_quaternion
+from topograph.topomap import TopoMap, Viewpoint
+
+SCHEMA_VERSION = 1
+_WGS84 = (
+    'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563,AUTHORITY["EPSG","7030"]],'
+    'AUTHORITY["EPSG","6326"]],PRIMEM["Greenwich",0,AUTHORITY["EPSG","8901"]],'
+    'UNIT["degree",0.0174532925199433,AUTHORITY["EPSG","9122"]],AUTHORITY["EPSG","4326"]]'
+)
+_TABLES = """
+CREATE TABLE gpkg_spatial_ref_sys (srs_name TEXT NOT NULL, srs_id INTEGER NOT NULL PRIMARY KEY,
+  organization TEXT NOT NULL, organization_coordsys_id INTEGER NOT NULL, definition TEXT NOT NULL, description TEXT);
+CREATE TABLE gpkg_contents (table_name TEXT NOT NULL PRIMARY KEY, data_type TEXT NOT NULL, identifier TEXT UNIQUE,
+  description TEXT DEFAULT '', last_change DATETIME NOT NULL DEFAULT (strftime('%Y-%m-%dT%H:%M:%fZ','now')),
+  min_x DOUBLE, min_y DOUBLE, max_x DOUBLE, max_y DOUBLE, srs_id INTEGER,
+  CONSTRAINT fk_gc_r_srs_id FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys(srs_id));
+CREATE TABLE gpkg_geometry_columns (table_name TEXT NOT NULL, column_name TEXT NOT NULL, geometry_type_name TEXT NOT NULL,
+  srs_id INTEGER NOT NULL, z TINYINT NOT NULL, m TINYINT NOT NULL,
+  CONSTRAINT pk_geom_cols PRIMARY KEY (table_name, column_name));
+CREATE TABLE trees (id INTEGER PRIMARY KEY NOT NULL, geom BLOB, x REAL, y REAL, z REAL, cov_xx REAL, cov_xy REAL,
+  cov_yy REAL, cov_zz REAL, axis_x REAL, axis_y REAL, axis_z REAL, diameter REAL, first_branch REAL,
+  sightings INTEGER, score REAL, "row" INTEGER);
+CREATE TABLE edges (id INTEGER PRIMARY KEY NOT NULL, a INTEGER NOT NULL, b INTEGER NOT NULL, length REAL, geom BLOB);
+CREATE TABLE path (id INTEGER PRIMARY KEY NOT NULL, stamp_ns INTEGER NOT NULL, x REAL, y REAL, z REAL,
+  qx REAL, qy REAL, qz REAL, qw REAL, geom BLOB);
+CREATE TABLE viewpoints (id INTEGER PRIMARY KEY NOT NULL, tree INTEGER NOT NULL, vx REAL, vy REAL, vz REAL,
+  points INTEGER, cloud BLOB, crc INTEGER);
+CREATE INDEX viewpoints_by_tree ON viewpoints (tree);
+CREATE TABLE meta (key TEXT PRIMARY KEY NOT NULL, value TEXT);
+"""
+
+
+def save(topo: TopoMap, path: Path) -> None:
+    """Write the map; a killed write leaves the file that was there before, or none.
+
+    Raises:
+        MapError: the folder cannot be written.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.unlink(missing_ok=True)
+        connection = sqlite3.connect(part)
+        try:
+            connection.execute("PRAGMA journal_mode=DELETE")
+            connection.execute("PRAGMA synchronous=FULL")
+            connection.execute(f"PRAGMA application_id={0x47504B47}")
+            connection.execute("PRAGMA user_version=10300")
+            connection.executescript(_TABLES)
+            with connection:
+                _fill(connection, topo)
+        finally:
+            connection.close()
+        os.replace(part, path)
+    except (OSError, sqlite3.Error) as err:
+        raise MapError(f"{path}: cannot be written ({err})") from err
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _fill(c: sqlite3.Connection, t: TopoMap) -> None:
+    srs = 4326 if t.datum is not None else -1
+    c.executemany(
+        "INSERT INTO gpkg_spatial_ref_sys VALUES (?,?,?,?,?,?)",
+        [
+            ("Undefined cartesian", -1, "NONE", -1, "undefined", "the map's own frame, metres"),
+            ("Undefined geographic", 0, "NONE", 0, "undefined", None),
+            ("WGS 84", 4326, "EPSG", 4326, _WGS84, "longitude, latitude, ellipsoidal height"),
+        ],
+    )
+    world = t.p if t.datum is None else _lon_lat(t.datum, t.p)
+    track = t.map_T_robot[:, :3, 3]
+    world_track = track if t.datum is None else _lon_lat(t.datum, track)
+    everything = np.concatenate([world, world_track]) if len(track) else world
+    box = [*everything[:, :2].min(0), *everything[:, :2].max(0)] if len(everything) else [None] * 4
+    for name, kind in (("trees", "POINT"), ("edges", "LINESTRING"), ("path", "POINT")):
+        c.execute(
+            "INSERT INTO gpkg_contents (table_name, data_type, identifier, min_x, min_y, max_x, max_y, srs_id) "
+            "VALUES (?,?,?,?,?,?,?,?)",
+            (name, "features", name, *(None if b is None else float(b) for b in box), srs),
+        )
+        c.execute("INSERT INTO gpkg_geometry_columns VALUES (?,?,?,?,?,?)", (name, "geom", kind, srs, 1, 0))
+    for name in ("viewpoints", "meta"):
+        c.execute("INSERT INTO gpkg_contents (table_name, data_type, identifier) VALUES (?,?,?)", (name, "attributes", name))
+    c.executemany(
+        "INSERT INTO trees VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)",
+        [
+            (
+                int(t.ids[i]), _geometry(world[i : i + 1], srs), *_real(t.p[i]),
+                *_real([t.cov[i, 0, 0], t.cov[i, 0, 1], t.cov[i, 1, 1], t.cov[i, 2, 2]]), *_real(t.axis[i]),
+                *_real([t.diameter[i], t.first_branch[i]]), int(t.sightings[i]), *_real([t.score[i]]), int(t.row[i]),
+            )
+            for i in range(len(t))
+        ],
+    )  # fmt: skip
+    c.executemany(
+        "INSERT INTO edges VALUES (?,?,?,?,?)",
+        [
+            (k + 1, int(t.ids[a]), int(t.ids[b]), float(t.lengths[k]), _geometry(world[[a, b]], srs))
+            for k, (a, b) in enumerate(t.edges.tolist())
+        ],
+    )
+    q = to_quaternion(t.map_T_robot) if len(track) else np.zeros((0, 4))
+    c.executemany(
+        "INSERT INTO path VALUES (?,?,?,?,?,?,?,?,?,?)",
+        [
+            (k + 1, int(t.stamps_ns[k]), *_real(track[k]), *_real(q[k]), _geometry(world_track[k : k + 1], srs))
+            for k in range(len(track))
+        ],
+    )
+    rows = []
+    for k, v in enumerate(t.viewpoints):
+        blob = np.clip(np.round(v.cloud * 1000.0), -32768, 32767).astype("<i2").tobytes()
+        rows.append((k + 1, int(t.ids[v.tree]), *_real(v.direction), len(v.cloud), blob, zlib.crc32(blob)))
+    c.executemany("INSERT INTO viewpoints VALUES (?,?,?,?,?,?,?,?)", rows)
+    meta = {
+        **t.meta,
+        "schema_version": str(SCHEMA_VERSION),
+        "datum": "" if t.datum is None else f"{t.datum.lat!r}, {t.datum.lon!r}, {t.datum.h!r}",
+        "georeferenced": "no: not georeferenced" if t.datum is None else "yes",
+        "datum_cov": " ".join(repr(float(v)) for v in t.datum_cov.ravel()),
+    }
+    c.executemany("INSERT INTO meta VALUES (?,?)", sorted(meta.items()))
+
+
+def _real(values: Array | list[float]) -> list[float | None]:
+    return [float(v) if np.isfinite(v) else None for v in values]
+
+
+def _lon_lat(datum: Datum, p: Array) -> Array:
+    return datum.to_geodetic(p)[:, [1, 0, 2]] if len(p) else np.zeros((0, 3))
+
+
+def _geometry(points: Array, srs: int) -> bytes:
+    """GeoPackage geometry: POINT Z of one point, LINESTRING Z of more."""
+    head = b"GP\x00\x01" + struct.pack("<i", srs)
+    if len(points) == 1:
+        return head + struct.pack("<BI3d", 1, 1001, *points[0])
+    return head + struct.pack("<BII", 1, 1002, len(points)) + np.ascontiguousarray(points, "<f8").tobytes()
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[sqlite3.Connection]:
+    if not path.exists():
+        raise MapError(f"{path}: no such map")
+    try:
+        c = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
+    except sqlite3.Error as err:
+        raise MapError(f"{path}: cannot be opened ({err})") from err
+    try:
+        row = c.execute("SELECT value FROM meta WHERE key='schema_version'").fetchone()
+        if row is None:
+            raise MapError(f"{path}: a GeoPackage, but not a topograph map (no schema version)")
+        if int(row[0]) > SCHEMA_VERSION:
+            raise MapError(f"{path}: schema {row[0]} is newer than this program's {SCHEMA_VERSION}: update topograph")
+        yield c
+    except (sqlite3.Error, ValueError, struct.error) as err:
+        raise MapError(f"{path}: not a topograph map, or damaged ({err})") from err
+    finally:
+        c.close()
+
+
+def load(path: Path, *, clouds: bool = True) -> TopoMap:
+    """Read a map; without `clouds` in a fraction of the time.
+
+    Raises:
+        MapError: missing, damaged, or of a newer schema.
+    """
+    with _opened(path) as c:
+        meta = dict(c.execute("SELECT key, value FROM meta"))
+        rows = c.execute(
+            "SELECT id, x, y, z, cov_xx, cov_xy, cov_yy, cov_zz, axis_x, axis_y, axis_z, diameter, first_branch, "
+            'sightings, score, "row" FROM trees ORDER BY id'
+        ).fetchall()
+        v = np.array([[np.nan if x is None else x for x in r] for r in rows], float).reshape(-1, 16)
+        ids = v[:, 0].astype(np.int64)
+        cov = np.zeros((len(v), 3, 3))
+        cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 0] = v[:, 4], v[:, 5], v[:, 5]
+        cov[:, 1, 1], cov[:, 2, 2] = v[:, 6], v[:, 7]
+        place = {int(i): k for k, i in enumerate(ids)}
+        edges = np.array([(place[a], place[b]) for a, b in c.execute("SELECT a, b FROM edges ORDER BY id")], np.int64)
+        path_rows = np.array(
+            c.execute("SELECT x, y, z, qx, qy, qz, qw FROM path ORDER BY id").fetchall(), float
+        ).reshape(-1, 7)
+        stamps = np.array([r[0] for r in c.execute("SELECT stamp_ns FROM path ORDER BY id")], np.int64)
+        views = tuple(_viewpoint(path, place, r) for r in c.execute(_VIEWS)) if clouds else ()
+    datum = Datum(*(float(x) for x in meta["datum"].split(","))) if meta.get("datum") else None
+    edges = edges.reshape(-1, 2)
+    p = v[:, 1:4]
+    return TopoMap(
+        datum, ids, p, cov, v[:, 8:11], v[:, 11], v[:, 12], v[:, 13].astype(np.int64), v[:, 14],
+        v[:, 15].astype(np.int64), edges, np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1), views, stamps,
+        from_quaternion(path_rows[:, :3], path_rows[:, 3:]) if len(stamps) else np.zeros((0, 4, 4)),
+        np.array([float(x) for x in meta.get("datum_cov", "0 " * 9).split()]).reshape(3, 3),
+        {k: x for k, x in meta.items() if k not in ("schema_version", "datum", "georeferenced", "datum_cov")},
+    )  # fmt: skip
+
+
+_VIEWS = "SELECT tree, vx, vy, vz, points, cloud, crc FROM viewpoints"
+
+
+def clouds_near(path: Path, xy: Array, radius: float) -> list[tuple[int, Array, NDArray[np.float32]]]:
+    """(tree id, direction (3,), cloud (M, 3) about the node) of the nodes within `radius` m of `xy`; reads no others."""
+    with _opened(path) as c:
+        x, y = float(xy[0]), float(xy[1])
+        found = c.execute(
+            "SELECT v.tree, vx, vy, vz, points, cloud, crc FROM viewpoints v JOIN trees t ON t.id = v.tree "
+            "WHERE t.x BETWEEN ? AND ? AND t.y BETWEEN ? AND ? AND (t.x-?)*(t.x-?)+(t.y-?)*(t.y-?) <= ?",
+            (x - radius, x + radius, y - radius, y + radius, x, x, y, y, radius**2),
+        ).fetchall()
+        views = [(r[0], _viewpoint(path, {r[0]: 0}, r)) for r in found]
+    return [(tree, v.direction, v.cloud) for tree, v in views]
+
+
+def _viewpoint(path: Path, place: dict[int, int], r: tuple[int, float, float, float, int, bytes, int]) -> Viewpoint:
+    tree, vx, vy, vz, points, blob, crc = r
+    if zlib.crc32(blob) != crc or len(blob) != 6 * points:
+        raise MapError(f"{path}: the cloud of tree {tree} is damaged; map the bags again or restore a copy")
+    return Viewpoint(place[tree], np.array([vx, vy, vz]), np.frombuffer(blob, "<i2").reshape(-1, 3).astype(np.float32) / 1000)

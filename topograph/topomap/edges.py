@@ -1,0 +1,81 @@
+"""Which trees are neighbours."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import Delaunay, QhullError
+
+from topograph.geometry import Array
+
+
+@dataclass(frozen=True, slots=True)
+class TopomapConfig:
+    """Nodes, viewpoints and edges.
+
+    Attributes:
+        edges: "gabriel" (no radius needed) or "radius" (the thesis's rule, 4.3.3).
+        radius: of the thesis's rule, m.
+        viewpoint_cosine: least inner product of viewpoints that are one (4.3.3).
+        clouds_per_viewpoint: clouds registered into one, the fullest first.
+        voxel: of a viewpoint cloud, m.
+    """
+
+    edges: str = "gabriel"
+    radius: float = 8.0
+    viewpoint_cosine: float = 0.87
+    clouds_per_viewpoint: int = 10
+    voxel: float = 0.02
+
+
+def neighbours(xy: Array, config: TopomapConfig) -> NDArray[np.int64]:
+    """Edges (E, 2) between trees at `xy` (T, 2), a < b.
+
+    Gabriel graph: two trees are neighbours when no third stands in the circle over their distance. It is part of the
+    Delaunay triangulation and needs no scale. The long edges that gaps and the outer rim leave are dropped: those
+    more than three times the median edge at both their ends.
+    """
+    n = len(xy)
+    if n < 2:
+        return np.zeros((0, 2), np.int64)
+    if config.edges == "radius":
+        d = np.linalg.norm(xy[:, None] - xy[None], axis=2) if n <= 4000 else None
+        if d is None:
+            from scipy.spatial import cKDTree
+
+            return np.asarray(np.sort(cKDTree(xy).query_pairs(config.radius, output_type="ndarray"), axis=1), np.int64)
+        i, j = np.nonzero(np.triu(d < config.radius, 1))
+        return np.stack([i, j], axis=1).astype(np.int64)
+    pairs = _delaunay_pairs(xy)
+    keep = np.ones(len(pairs), bool)
+    middle = 0.5 * (xy[pairs[:, 0]] + xy[pairs[:, 1]])
+    half2 = 0.25 * np.sum((xy[pairs[:, 0]] - xy[pairs[:, 1]]) ** 2, axis=1)
+    from scipy.spatial import cKDTree
+
+    distance, _ = cKDTree(xy).query(middle)
+    keep &= distance**2 >= half2 * (1 - 1e-9)
+    pairs = pairs[keep]
+    length = np.linalg.norm(xy[pairs[:, 0]] - xy[pairs[:, 1]], axis=1)
+    local = np.array([np.median(length[(pairs == i).any(axis=1)]) if (pairs == i).any() else np.inf for i in range(n)])
+    short = length <= 3.0 * np.maximum(np.minimum(local[pairs[:, 0]], local[pairs[:, 1]]), np.median(length))
+    return np.asarray(pairs[short], np.int64)
+
+
+def _delaunay_pairs(xy: Array) -> NDArray[np.int64]:
+    n = len(xy)
+    try:
+        simplices = Delaunay(xy).simplices if n >= 4 else None
+    except QhullError:  # all on one line
+        simplices = None
+    if simplices is None:
+        if n <= 3:
+            pairs = [(a, b) for a in range(n) for b in range(a + 1, n)]
+        else:
+            main = np.linalg.svd(xy - xy.mean(0), full_matrices=False)[2][0]
+            order = np.argsort(xy @ main)
+            pairs = [tuple(sorted((int(a), int(b)))) for a, b in zip(order, order[1:], strict=False)]
+        return np.array(pairs, np.int64).reshape(-1, 2)
+    edges = np.concatenate([simplices[:, [0, 1]], simplices[:, [1, 2]], simplices[:, [2, 0]]])
+    return np.asarray(np.unique(np.sort(edges, axis=1), axis=0), np.int64)

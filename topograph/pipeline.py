@@ -15,11 +15,23 @@ from numpy.typing import NDArray
 from topograph.bags import Recording, Scan, Trunks
 from topograph.config import Config
 from topograph.errors import InputError, InsufficientDataError
-from topograph.estimate import Estimate, Problem, graph, path_at
+from topograph.estimate import Estimate, KnownTrees, Problem, average, graph, path_at
 from topograph.estimate.assemble import assemble, choose_datum
+from topograph.evaluate import Metric, fix_metrics
 from topograph.geometry import Array, inverse, transform
 from topograph.motion import Motion, Streams, StreamsBuilder, align_imu, dead_reckon, twist_during
-from topograph.trees import Detections, LoopCloser, choose_keyframes, exists, follow, gather, refine, tabulate
+from topograph.topomap import TopoMap, build, merge
+from topograph.trees import (
+    Detections,
+    LoopCloser,
+    TrackTable,
+    choose_keyframes,
+    exists,
+    follow,
+    gather,
+    refine,
+    tabulate,
+)
 from topograph.trunks import TrunksConfig, from_recorded
 
 log = logging.getLogger(__name__)
@@ -160,11 +172,15 @@ def _detector(recording: Recording, config: TrunksConfig) -> Callable[[Scan, Str
     return detect
 
 
-def solve_run(run: Run, config: Config, *, check_fixes: int = 0, progress: Progress = _silent) -> Solved:
+def solve_run(
+    run: Run, config: Config, *, check_fixes: int = 0, known: TopoMap | None = None, progress: Progress = _silent
+) -> Solved:
     """Associate and solve. Every `check_fixes`-th fix is withheld from the estimator and kept for checking.
 
+    With a `known` map the run is put into its frame, and its trees are landmarks with their covariances.
+
     Raises:
-        InsufficientDataError: neither motion nor fixes.
+        InsufficientDataError: neither motion nor fixes; or a known map and no common frame.
     """
     began = time.perf_counter()
     notes, skipped = run.notes, run.skipped
@@ -188,6 +204,10 @@ def solve_run(run: Run, config: Config, *, check_fixes: int = 0, progress: Progr
     if check_fixes == 1:
         used[:] = False
     datum = choose_datum(run.streams, used)
+    if known is not None:
+        if known.datum is None or datum is None:
+            raise InsufficientDataError("a map is extended in its own frame: both the map and the run need GNSS fixes")
+        datum = known.datum
     if datum is None:
         notes.append("no usable GNSS fixes: the map is not georeferenced")
     keyframes = _keyframes(detections, motion, config)
@@ -196,12 +216,24 @@ def solve_run(run: Run, config: Config, *, check_fixes: int = 0, progress: Progr
         keyframes, motion, config.motion, inertial, run.streams, used, _or(run.mounts.get("fix"), eye),
         _or(run.mounts.get("heading"), eye), datum, detections, config.estimate, skipped,
     )  # fmt: skip
+    if known is not None:
+        problem = replace(problem, known=_known_trees(known, detections))
     seconds = {"read": run.seconds}
     tree, problem, estimate, score, hits, rejected, loops = _associate_and_solve(problem, config, progress)
     seconds["associate and solve"] = time.perf_counter() - began
     return Solved(
         run, motion, detections, problem, estimate, tree, score, hits, np.flatnonzero(~used), rejected, loops, seconds
     )
+
+
+def _known_trees(topo: TopoMap, detections: Detections) -> KnownTrees:
+    """A map's trees as landmarks: on their axes, at the height where the detections state theirs."""
+    above = detections.height[np.isfinite(detections.height)]
+    height = float(np.median(above)) if len(above) else 0.0
+    p = topo.p + topo.axis * (height / np.maximum(topo.axis[:, 2:], 0.3))
+    cov = np.where(np.isfinite(topo.cov), topo.cov, 0.0)
+    cov[:, [0, 1, 2], [0, 1, 2]] = np.maximum(cov[:, [0, 1, 2], [0, 1, 2]], 1e-5)
+    return KnownTrees(p, cov, np.full(len(p), -1, np.int64))
 
 
 def _or(pose: Array | None, other: Array) -> Array:
@@ -219,58 +251,109 @@ def _keyframes(detections: Detections, motion: Motion, config: Config) -> NDArra
     return stamps[choose_keyframes(motion, stamps, c.keyframe_distance, c.keyframe_turn, c.keyframe_seconds)]
 
 
+class _Association:
+    """The state of associate <-> solve: tracks, their trees, and the problem that follows from them."""
+
+    def __init__(self, problem: Problem, config: Config) -> None:
+        d = problem.detections
+        self.problem, self.config = problem, config
+        self.track = follow(d, problem.motion, config.trees)
+        self.tracks = int(self.track.max(initial=-1)) + 1
+        self.distance = problem.motion.distance_at(d.stamps_ns)[d.scan] if len(d) else np.zeros(0)
+        self.variance = 0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1])
+        self.known = len(problem.known.p) if problem.known is not None else 0
+        self.closer = LoopCloser(self.tracks + self.known, problem.motion.gyro, config.trees, config.motion)
+        self.tree_of_track = self.closer.tree
+
+    def poses(self, e: Estimate) -> Array:
+        """map_T_scan (S, 4, 4)."""
+        return path_at(e.stamps_ns, e.map_T_robot, self.problem.motion, self.problem.detections.stamps_ns)
+
+    def table(self, e: Estimate) -> TrackTable:
+        """Tracks in the map as estimated; trees of an earlier map are tracks seen long ago."""
+        d = self.problem.detections
+        xy = transform(self.poses(e)[d.scan], d.p)[:, :2]
+        t = tabulate(xy, self.variance, self.track, self.distance)
+        k = self.problem.known
+        if k is None:
+            return t
+        long_ago = np.full(self.known, -1e9)
+        return TrackTable(
+            np.concatenate([t.place, k.p[:, :2]]),
+            np.concatenate([t.sigma, np.sqrt(0.5 * (k.cov[:, 0, 0] + k.cov[:, 1, 1]))]),
+            np.concatenate([t.first, long_ago]),
+            np.concatenate([t.last, long_ago]),
+            np.concatenate([t.hits, np.full(self.known, 1000)]),
+        )
+
+    def solve(self, e: Estimate, *, least: int = 3) -> Estimate:
+        """A quick estimate with the trees as they are now."""
+        self.problem, _, _ = self.with_trees(self.tree_of_track, least)
+        self.problem = replace(self.problem, start=e.map_T_robot)
+        return graph.solve(self.problem, self.config.estimate, quick=True)
+
+    def with_trees(
+        self, tree_of_track: NDArray[np.int64], least: int, keep: NDArray[np.bool_] | None = None
+    ) -> tuple[Problem, NDArray[np.int64], NDArray[np.int64]]:
+        """Problem, tree (N,) of each detection and former name (T,) of each tree, for trees of `least` detections."""
+        tree = tree_of_track[self.track]
+        size = int(tree_of_track.max(initial=-1)) + 1
+        hits = np.bincount(tree, minlength=size)
+        exists_ = hits >= max(least, 1)
+        if keep is not None:
+            exists_ &= keep
+        ids = np.flatnonzero(exists_)
+        name = np.full(size, -1, np.int64)
+        name[ids] = np.arange(len(ids))
+        tree = name[tree]
+        p = self.problem
+        known = None if p.known is None else replace(p.known, tree=name[tree_of_track[self.tracks :]])
+        sightings = gather(p.detections, tree, p.stamps_ns, p.motion)
+        return replace(p, sightings=sightings, n_trees=len(ids), known=known), tree, ids
+
+
 def _associate_and_solve(
     problem: Problem, config: Config, progress: Progress
 ) -> tuple[NDArray[np.int64], Problem, Estimate, Array, NDArray[np.int64], int, int]:
-    d, motion = problem.detections, problem.motion
-    progress("track", 0.0)
-    track = follow(d, motion, config.trees)
-    distance = motion.distance_at(d.stamps_ns)[d.scan] if len(d) else np.zeros(0)
-    variance = 0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1])
+    d = problem.detections
     estimate = graph.solve(problem, config.estimate, quick=True)
-    closer = LoopCloser(int(track.max(initial=-1)) + 1, motion.gyro, config.trees, config.motion)
-    end = float(motion.distance[-1])
-    cap = _gnss_cap(problem, closer)
-
-    def table_of(e: Estimate) -> tuple[Array, object]:
-        map_T_scan = path_at(e.stamps_ns, e.map_T_robot, motion, d.stamps_ns)
-        return map_T_scan, tabulate(transform(map_T_scan[d.scan], d.p)[:, :2], variance, track, distance)
-
-    if len(d):
-        for _ in range(200):
-            _, table = table_of(estimate)
-            moved = closer.advance(table, end, cap)  # type: ignore[arg-type]
-            progress("associate", min(1.0, closer.at / max(end, 1e-9)))
-            if not moved:
-                break
-            problem, estimate, _ = _solve_with(problem, closer.tree[track], config, estimate, quick=True)
-    tree_of_track = closer.tree
-    score, hits = np.zeros(0), np.zeros(0, np.int64)
-    rejected = 0
-    tree = np.full(len(d), -1, np.int64)
-    if len(d):
-        for n in range(3):
-            progress("refine", n / 3)
-            _, table = table_of(estimate)
-            tree_of_track = refine(table.place, table.sigma, table.hits, tree_of_track, config.trees)  # type: ignore[attr-defined]
-            problem, estimate, _ = _solve_with(problem, tree_of_track[track], config, estimate, quick=True)
-        map_T_scan, table = table_of(estimate)
-        tree_of_track = refine(table.place, table.sigma, table.hits, tree_of_track, config.trees)  # type: ignore[attr-defined]
-        problem, tree, ids = _with_trees(problem, tree_of_track[track], 1, config)
-        places = np.zeros((len(ids), 3))
-        seen = transform(map_T_scan[d.scan], d.p)
-        for k in range(3):
-            places[:, k] = np.bincount(tree[tree >= 0], seen[tree >= 0, k], minlength=len(ids)) / np.maximum(
-                np.bincount(tree[tree >= 0], minlength=len(ids)), 1
-            )
-        ok, score, hits, _ = exists(d, tree, map_T_scan, places, config.trees)
-        rejected = int((~ok).sum())
-        tree = np.where((tree >= 0) & ok[np.maximum(tree, 0)], tree, -1)
-        score, hits = score[ok], hits[ok]
+    if not len(d):
+        problem = replace(problem, start=estimate.map_T_robot)
+        none = np.zeros(0, np.int64)
+        return none, problem, replace(graph.solve(problem, config.estimate), tree=none), np.zeros(0), none, 0, 0
+    a = _Association(problem, config)
+    end = float(problem.motion.distance[-1])
+    cap = _gnss_cap(problem, a.closer)
+    while a.closer.advance(a.table(estimate), end, cap):
+        progress("associate", min(1.0, a.closer.at / max(end, 1e-9)))
+        a.tree_of_track = a.closer.tree
+        estimate = a.solve(estimate)
+    progress("associate", 1.0)
+    a.tree_of_track = a.closer.tree
+    for n in range(3):
+        progress("refine", n / 3)
+        t = a.table(estimate)
+        a.tree_of_track = refine(t.place, t.sigma, t.hits, a.tree_of_track, config.trees)
+        estimate = a.solve(estimate)
+    t = a.table(estimate)
+    a.tree_of_track = refine(t.place, t.sigma, t.hits, a.tree_of_track, config.trees)
+    problem, tree, ids = a.with_trees(a.tree_of_track, 1)
+    map_T_scan = a.poses(estimate)
+    seen = transform(map_T_scan[d.scan], d.p)
+    count = np.maximum(np.bincount(tree, minlength=len(ids)), 1)
+    places = np.stack([np.bincount(tree, seen[:, k], minlength=len(ids)) / count for k in range(3)], axis=1)
+    ok, score, hits, _ = exists(d, tree, map_T_scan, places, config.trees)
+    keep = np.zeros(int(a.tree_of_track.max(initial=-1)) + 1, bool)
+    keep[ids[ok]] = True
+    if problem.known is not None:  # what the map knows exists, however rarely this run saw it
+        keep[a.tree_of_track[a.tracks :]] = True
+    problem, tree, final = a.with_trees(a.tree_of_track, 1, keep)
     progress("solve", 0.0)
-    problem, estimate, tree = _solve_with(problem, tree, config, estimate, quick=False, least=1)
+    problem = replace(problem, start=estimate.map_T_robot)
+    estimate = graph.solve(problem, config.estimate)
     progress("solve", 1.0)
-    return tree, problem, replace(estimate, tree=tree), score, hits, rejected, closer.loops
+    place = np.searchsorted(ids, final)
+    return tree, problem, replace(estimate, tree=tree), score[place], hits[place], int((~ok).sum()), a.closer.loops
 
 
 def _gnss_cap(problem: Problem, closer: LoopCloser) -> float:
@@ -284,30 +367,90 @@ def _gnss_cap(problem: Problem, closer: LoopCloser) -> float:
     return max(0.5, 4.0 * sigma) + closer.drift(0.5 * float(np.diff(edges).max()))[0]
 
 
-def _with_trees(
-    problem: Problem, tree: NDArray[np.int64], least: int, config: Config
-) -> tuple[Problem, NDArray[np.int64], NDArray[np.int64]]:
-    """The problem with the sightings of trees that have `least` detections, renumbered."""
-    hits = np.bincount(tree[tree >= 0]) if (tree >= 0).any() else np.zeros(0, np.int64)
-    ids = np.flatnonzero(hits >= max(least, 1))
-    name = np.full(len(hits) + 1, -1, np.int64)
-    name[ids] = np.arange(len(ids))
-    tree = name[tree]
-    sightings = gather(problem.detections, tree, problem.stamps_ns, problem.motion)
-    return replace(problem, sightings=sightings, n_trees=len(ids)), tree, ids
-
-
-def _solve_with(
-    problem: Problem, tree: NDArray[np.int64], config: Config, start: Estimate, *, quick: bool, least: int = 3
-) -> tuple[Problem, Estimate, NDArray[np.int64]]:
-    problem, tree, _ = _with_trees(problem, tree, least, config)
-    problem = replace(problem, start=start.map_T_robot)
-    return problem, graph.solve(problem, config.estimate, quick=quick), tree
-
-
-def require_trees(solved: Solved) -> None:
-    """Raises InsufficientDataError when a run has scans or detections but no tree came of them."""
+def why_no_trees(solved: Solved) -> str:
+    """One line on why a map has no trees; "" when it has some."""
+    if solved.problem.n_trees:
+        return ""
     if solved.run.scans == 0:
-        raise InputError("no trunks: the recording has no point cloud and no trunk detections; name one with --topic-points")
-    if solved.problem.n_trees == 0:
-        raise InsufficientDataError(f"no trunks: none of {solved.run.scans} scans showed a tree often enough to be mapped")
+        return "no trunks: the recording has no point cloud and no trunk detections (name one with --topic-points or --topic-trunks)"
+    return f"no trunks: none of {solved.run.scans} scans showed a tree often enough to be mapped"
+
+
+def map_T_scans(solved: Solved) -> Array:
+    """Poses (S, 4, 4) of the scans in the estimate."""
+    e = solved.estimate
+    return path_at(e.stamps_ns, e.map_T_robot, solved.motion, solved.detections.stamps_ns)
+
+
+def topo_map(solved: Solved, config: Config, meta: dict[str, str]) -> TopoMap:
+    """The map of a solved run."""
+    ordered = sorted(solved.run.trunks, key=lambda t: t.stamp_ns)
+    unique = [t for i, t in enumerate(ordered) if i == 0 or t.stamp_ns > ordered[i - 1].stamp_ns]
+    return build(
+        solved.estimate, solved.detections, unique, map_T_scans(solved), solved.score, solved.problem.datum, config.topomap, meta
+    )
+
+
+def baseline(solved: Solved, config: Config) -> tuple[Estimate, TopoMap]:
+    """The thesis's map of the same detections: Algorithm 3 with filtered poses, nodes with few sightings left out.
+
+    The thesis kept every node; without a bound each false detection would be a tree. The same bound as ours is used.
+    """
+    e = average.solve(solved.problem, config.estimate)
+    hits = np.bincount(e.tree[e.tree >= 0], minlength=len(e.trees))
+    keep = hits >= config.trees.min_sightings
+    name = np.where(keep, np.cumsum(keep) - 1, -1)
+    tree = np.where(e.tree >= 0, name[np.maximum(e.tree, 0)], -1)
+    e = replace(e, trees=e.trees[keep], tree_cov=e.tree_cov[keep], tree=tree)
+    poses = path_at(e.stamps_ns, e.map_T_robot, solved.motion, solved.detections.stamps_ns)
+    topo = build(
+        e, solved.detections, [], poses, np.zeros(int(keep.sum())), solved.problem.datum, config.topomap, {"method": "thesis"}
+    )
+    return e, topo
+
+
+def residual_metrics(solved: Solved) -> list[Metric]:
+    """What can be said without truth: loops, doubles are in the map's metrics; here residuals and held-out fixes."""
+    e, s = solved.estimate, solved.problem.sightings
+    out = [
+        Metric("keyframes", len(e.stamps_ns)),
+        Metric("distance driven", float(solved.motion.distance[-1]), "m"),
+        Metric("loops closed", solved.loops),
+    ]
+    if len(s):
+        seen = transform(e.map_T_robot[s.keyframe], s.p) - e.trees[s.tree]
+        r = np.linalg.norm(seen[:, :2], axis=1)
+        out.append(Metric("trunk residual median", float(np.median(r)), "m", "lower"))
+        out.append(Metric("trunk sightings", int(s.count.sum())))
+    if len(solved.held_out) and solved.problem.datum is not None:
+        streams, i = solved.run.streams, solved.held_out
+        inside = (streams.fix_ns[i] >= e.stamps_ns[0]) & (streams.fix_ns[i] <= e.stamps_ns[-1])
+        i = i[inside]
+        poses = path_at(e.stamps_ns, e.map_T_robot, solved.motion, streams.fix_ns[i])
+        antenna = transform(poses, _or(solved.run.mounts.get("fix"), np.eye(4))[:3, 3])
+        fix = solved.problem.datum.to_enu(streams.lat_lon_h[i])
+        out += fix_metrics(antenna, fix, np.sqrt(streams.fix_cov[i, 0, 0]))
+    return out
+
+
+def extend(old: TopoMap, new: TopoMap, solved: Solved, config: Config) -> TopoMap:
+    """The old map with a further run in it: trees seen again are updated, the others kept, new ones added."""
+    known = solved.problem.known
+    assert known is not None
+    return merge(old, new, known.tree, config.topomap)
+
+
+def scan_near(paths: Sequence[Path], config: Config, stamp_ns: int, trunks: Sequence[Trunks]) -> tuple[Scan, Array, Trunks]:
+    """The scan nearest to a stamp, the LiDAR's mounting, and the trunks found in it."""
+    with Recording(paths, config.bags) as recording:
+        best: Scan | None = None
+        for _, m in recording.messages(["points"]):
+            assert isinstance(m, Scan)
+            if best is None or abs(m.stamp_ns - stamp_ns) < abs(best.stamp_ns - stamp_ns):
+                best = m
+            elif m.stamp_ns > stamp_ns:
+                break
+        if best is None:
+            raise InputError("no point cloud to draw: the recording holds trunk detections only")
+        mount = recording.frames.get(best.frame)
+    return best, mount, min(trunks, key=lambda t: abs(t.stamp_ns - best.stamp_ns))

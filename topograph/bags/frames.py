@@ -60,3 +60,7 @@ class Frames:
                 f"add --extrinsic {frame}=X,Y,Z,ROLL,PITCH,YAW (metres, radians) or choose --base-frame"
             )
         return found
+
+    def names(self) -> list[str]:
+        """All frames with a way to the base."""
+        return sorted(f for f in {*self._edges, *self._given} if self.find(f) is not None)

@@ -120,6 +120,10 @@ def _add_tree_priors(g: Any, problem: Problem) -> None:
     """Keep every tree in the system even when a loss has given up on all its sightings."""
     wide = factors.sigmas([100.0] * 3)
     s = problem.sightings
+    if problem.known is not None:
+        k = problem.known
+        for i in np.flatnonzero(k.tree >= 0).tolist():
+            g.add(gtsam.PriorFactorPoint3(L + int(k.tree[i]), k.p[i], factors.gaussian(k.cov[i])))
     first = np.unique(s.tree, return_index=True)[1]
     T = problem.start if problem.start is not None else problem.odom_T_robot
     for i in first.tolist():

@@ -71,6 +71,16 @@ class Headings:
 
 
 @dataclass(frozen=True, slots=True)
+class KnownTrees:
+    """Trees of an earlier map: landmarks (Q, 3) in the same frame, covariances (Q, 3, 3), and which tree of
+    `sightings` each one is, (Q,), -1 where it was not seen."""
+
+    p: Array
+    cov: Array
+    tree: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
 class Problem:
     """A run, ready for an estimator.
 
@@ -87,6 +97,7 @@ class Problem:
         n_trees: number of trees in `sightings`.
         pose_sigma: when the path is known beforehand (`start`), its deviation (m, rad); else None.
         start: (K, 4, 4) first guess of `map_T_robot`, or None.
+        known: trees that an earlier map knows, or None.
     """
 
     stamps_ns: Stamps
@@ -103,6 +114,7 @@ class Problem:
     n_trees: int
     pose_sigma: float | None = None
     start: Array | None = None
+    known: KnownTrees | None = None
 
 
 @dataclass(frozen=True, slots=True)

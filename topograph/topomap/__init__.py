@@ -3,6 +3,7 @@
 from topograph.topomap.build import build
 from topograph.topomap.edges import TopomapConfig, neighbours
 from topograph.topomap.map import TopoMap, Viewpoint
+from topograph.topomap.merge import merge
 from topograph.topomap.rows import find_rows
 
-__all__ = ["TopoMap", "TopomapConfig", "Viewpoint", "build", "find_rows", "neighbours"]
+__all__ = ["TopoMap", "TopomapConfig", "Viewpoint", "build", "find_rows", "merge", "neighbours"]

@@ -1,0 +1,515 @@
+"""Words -> pipeline -> report. The only place that prints and exits."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import platform
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+import numpy as np
+
+from topograph import __version__
+from topograph.errors import InputError, TopographError, UsageError
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+_TOPICS = ("points", "trunks", "odometry", "imu", "fix", "heading")
+
+
+class _Group(click.Group):
+    """Turns errors into one line on stderr and their exit code."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except TopographError as err:
+            click.echo(f"topograph: {err}", err=True)
+            ctx.exit(err.exit_code)
+        except BrokenPipeError:
+            os._exit(0)
+
+
+@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__)
+@click.option("-v", "--verbose", is_flag=True, help="Say what happens inside.")
+def main(verbose: bool) -> None:
+    """Topological maps of orchards from robot recordings, by factor graph."""
+    logging.basicConfig(level=logging.DEBUG if verbose else logging.ERROR, format="%(name)s: %(message)s")
+    if not verbose:
+        logging.getLogger("topograph").setLevel(logging.WARNING)
+
+
+def _input_options(f: _F) -> _F:
+    for kind in reversed(_TOPICS):
+        f = click.option(f"--topic-{kind}", default=None, metavar="TOPIC", help=f"Topic of {kind}; 'none' ignores it.")(f)
+    f = click.option("--base-frame", default=None, help="Frame whose poses are estimated (base_link).")(f)
+    f = click.option(
+        "--extrinsic", multiple=True, metavar="FRAME=X,Y,Z,R,P,Y",
+        help="Mounting of a sensor in the base frame, metres and radians; repeat for more.",
+    )(f)  # fmt: skip
+    f = click.option("--front-end", type=click.Choice(["organised", "thesis"]), default=None, help="How trunks are found.")(f)
+    return click.option("-c", "--config", "config_file", type=click.Path(path_type=Path), help="YAML of `topograph config`.")(f)
+
+
+def _config(config_file: Path | None, words: dict[str, Any]) -> Any:
+    from topograph.config import load
+
+    overrides: dict[str, Any] = {}
+    for kind in _TOPICS:
+        if words.get(f"topic_{kind}"):
+            overrides[f"bags.topic_{kind}"] = words[f"topic_{kind}"]
+    if words.get("base_frame"):
+        overrides["bags.base_frame"] = words["base_frame"]
+    if words.get("front_end"):
+        overrides["trunks.front_end"] = words["front_end"]
+    mounts = {}
+    for word in words.get("extrinsic") or ():
+        frame, _, numbers = word.partition("=")
+        try:
+            values = tuple(float(x) for x in numbers.split(","))
+        except ValueError:
+            values = ()
+        if len(values) != 6 or not frame:
+            raise UsageError(f"--extrinsic {word}: give FRAME=X,Y,Z,ROLL,PITCH,YAW, metres and radians")
+        mounts[frame] = values
+    if mounts:
+        overrides["bags.extrinsics"] = mounts
+    return load(config_file, overrides)
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Callable[[str, float], None]]:
+    """A bar with rate and time left on a terminal; a line per stage elsewhere."""
+    if quiet or not sys.stderr.isatty():
+        said: dict[str, int] = {}
+        began = time.monotonic()
+
+        def plain(stage: str, share: float) -> None:
+            step = int(4 * share)
+            if not quiet and said.get(stage, -1) < step:
+                said[stage] = step
+                click.echo(f"{stage}: {100 * share:.0f} % ({time.monotonic() - began:.0f} s)", err=True)
+
+        yield plain
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description:>16}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"),
+               TimeElapsedColumn(), TimeRemainingColumn())  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        tasks: dict[str, Any] = {}
+
+        def show(stage: str, share: float) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=1.0)
+            bar.update(tasks[stage], completed=share)
+
+        yield show
+
+
+def _results(folder: Path | None) -> Path:
+    """The folder for a run's results; without a name results/<stamp>, and `latest` points there."""
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+    root = Path("results")
+    out = root / datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S_%f")
+    out.mkdir(parents=True)
+    link = root / "latest"
+    part = root / f".latest.{os.getpid()}"
+    part.unlink(missing_ok=True)
+    part.symlink_to(out.name)
+    part.replace(link)
+    return out
+
+
+def _hash(path: Path) -> str:
+    """SHA-256 of a file, or of a folder's files in order of name."""
+    h = hashlib.sha256()
+    for p in [path] if path.is_file() else sorted(q for q in path.rglob("*") if q.is_file()):
+        with p.open("rb") as f:
+            while block := f.read(1 << 22):
+                h.update(block)
+    return h.hexdigest()
+
+
+def _versions() -> dict[str, str]:
+    names = ("gtsam", "numpy", "scipy", "numba", "rosbags")
+    return {"topograph": __version__, "python": platform.python_version(), **{n: metadata.version(n) for n in names}}
+
+
+def _peak_mb() -> float:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1024 if sys.platform != "darwin" else peak / 1024**2
+
+
+def _truth(folder: Path | None, bags: Sequence[Path]) -> Any:
+    """The truth that was named; none is looked for: an estimator must not find it by itself."""
+    from topograph.evaluate import Truth
+
+    del bags
+    return None if folder is None else Truth.load(folder)
+
+
+def _table(metrics: Sequence[Any]) -> None:
+    from topograph.report.page import show
+
+    for m in metrics:
+        click.echo(f"  {m.name:<38} {show(m):>12}")
+
+
+@main.command("map")
+@click.argument("bags", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="The map file (.gpkg).")
+@click.option("--into", type=click.Path(path_type=Path), help="Extend this map by the run; the file is replaced whole.")
+@click.option("--results", type=click.Path(path_type=Path), help="Folder for path, report and configuration.")
+@click.option("--truth", type=click.Path(path_type=Path), help="Folder of simulated truth to compare with.")
+@click.option("--check-fixes", type=click.IntRange(0), default=0, metavar="N",
+              help="Withhold every N-th fix from the estimator and report the path's distance from it (1: withhold all).")  # fmt: skip
+@click.option("-q", "--quiet", is_flag=True, help="No progress.")
+@_input_options
+def map_command(
+    bags: tuple[Path, ...], output: Path | None, into: Path | None, results: Path | None, truth: Path | None,
+    check_fixes: int, quiet: bool, config_file: Path | None, **words: Any,
+) -> None:  # fmt: skip
+    """Make a map of the trees in BAGS (one run)."""
+    from topograph import pipeline, store
+
+    if output is not None and into is not None:
+        raise UsageError("-o makes a new map, --into extends one: give one of them")
+    config = _config(config_file, words)
+    true = _truth(truth, bags)
+    old = None if into is None else store.load(into)
+    folder = _results(results)
+    target = into or output or folder / "map.gpkg"
+    if target.suffix != ".gpkg":
+        raise UsageError(f"{target}: a map is a GeoPackage; end its name in .gpkg")
+    with _progress(quiet) as progress:
+        run = pipeline.read_run(bags, config, progress)
+        solved = pipeline.solve_run(run, config, check_fixes=check_fixes, known=old, progress=progress)
+        topo = _save_results(solved, config, bags, folder, target, true, old, progress)
+    no_trees = pipeline.why_no_trees(solved)
+    for note in run.notes:
+        click.echo(f"note: {note}", err=True)
+    if no_trees:
+        click.echo(f"topograph: {no_trees}; the path is in {folder / 'path.tum'}", err=True)
+        raise SystemExit(4)
+    where = "georeferenced" if topo.datum is not None else "not georeferenced"
+    click.echo(f"{target}: {len(topo)} trees, {len(topo.edges)} edges, {where}; report: {folder / 'report.html'}")
+
+
+def _save_results(
+    solved: Any, config: Any, bags: Sequence[Path], folder: Path, target: Path, true: Any, old: Any,
+    progress: Callable[[str, float], None],
+) -> Any:  # fmt: skip
+    """Write the map (if it has trees), path, configuration and reports; returns the map."""
+    import json
+
+    from topograph import pipeline, report, store
+    from topograph.config import dump
+    from topograph.evaluate import map_metrics, path_metrics, write_tum
+    from topograph.evaluate.metrics import doubles, tree_errors
+    from topograph.report.record import write_text
+
+    began = time.perf_counter()
+    inputs = [{"path": p.name, "sha256": _hash(p)} for p in bags]
+    text = dump(config)
+    meta = {"config": text, "inputs": json.dumps(inputs), "versions": json.dumps(_versions())}
+    progress("map", 0.0)
+    topo = pipeline.topo_map(solved, config, meta)
+    if old is not None:
+        topo = pipeline.extend(old, topo, solved, config)
+    metrics = pipeline.residual_metrics(solved)
+    figures, true_trees = {}, None
+    if true is not None:
+        e = solved.estimate
+        datum = solved.problem.datum
+        metrics = map_metrics(topo, true) + path_metrics(
+            e.stamps_ns, e.map_T_robot, datum, true.stamps_ns, true.world_T_robot, true.datum if datum is not None else None
+        ) + metrics
+        true_trees = true.trees_in(topo.datum) if topo.datum is not None else None
+        _, _, error = tree_errors(topo, true)
+        if len(error):
+            figures["Errors of the trees"] = report.tree_error_figure(np.linalg.norm(error[:, :2], axis=1))
+    else:
+        metrics = [doubles(topo), *metrics]
+    if len(topo):
+        picture = report.map_figure(topo, true_trees)
+        (folder / "map.png").write_bytes(picture)
+    if solved.estimate.residuals:
+        figures["Residuals by factor"] = report.residual_figure(solved.estimate.residuals)
+        (folder / "residuals.png").write_bytes(figures["Residuals by factor"])
+    seconds = {**solved.seconds, "map and report": time.perf_counter() - began}
+    write_tum(folder / "path.tum", solved.estimate.stamps_ns, solved.estimate.map_T_robot)
+    write_text(folder / "config.yaml", text)
+    notes = list(solved.run.notes) + ([pipeline.why_no_trees(solved)] if pipeline.why_no_trees(solved) else [])
+    facts = {"from": ", ".join(p.name for p in bags), "recorded": f"{solved.run.duration_s:.0f} s", "topograph": __version__}
+    if solved.problem.n_trees:
+        store.save(topo, target)
+    report.write_json(
+        folder / "report.json", metrics, solved.run.skipped, inputs, seconds, _peak_mb(), notes=notes, versions=_versions(),
+        topics=solved.run.chosen, scales=solved.estimate.scales,
+    )  # fmt: skip
+    report.write_page(
+        folder / "report.html", f"Map of {', '.join(p.name for p in bags)}", topo, metrics, figures, solved.run.skipped, notes,
+        facts, true_trees,
+    )  # fmt: skip
+    progress("map", 1.0)
+    return topo
+
+
+@main.command()
+@click.argument("bags", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--truth", type=click.Path(path_type=Path), help="Folder of simulated truth to compare with.")
+@click.option("--results", type=click.Path(path_type=Path), help="Folder for the figure and report.json.")
+@click.option("-q", "--quiet", is_flag=True, help="No progress.")
+@_input_options
+def compare(
+    bags: tuple[Path, ...], truth: Path | None, results: Path | None, quiet: bool, config_file: Path | None, **words: Any
+) -> None:
+    """Map BAGS by factor graph and by the thesis's averaging, side by side on the same detections."""
+    from topograph import pipeline, report
+    from topograph.evaluate import map_metrics, path_metrics
+    from topograph.evaluate.metrics import doubles, tree_errors
+    from topograph.report.page import show
+
+    config = _config(config_file, words)
+    true = _truth(truth, bags)
+    folder = _results(results)
+    with _progress(quiet) as progress:
+        run = pipeline.read_run(bags, config, progress)
+        solved = pipeline.solve_run(run, config, progress=progress)
+        ours = pipeline.topo_map(solved, config, {})
+        estimate, theirs = pipeline.baseline(solved, config)
+    rows: dict[str, list[Any]] = {}
+    errors = {}
+    for name, topo, e in (("graph", ours, solved.estimate), ("thesis", theirs, estimate)):
+        metrics = [doubles(topo)]
+        if true is not None:
+            datum = topo.datum
+            metrics = map_metrics(topo, true) + path_metrics(
+                e.stamps_ns, e.map_T_robot, datum, true.stamps_ns, true.world_T_robot, true.datum if datum is not None else None
+            )
+            errors[name] = np.linalg.norm(tree_errors(topo, true)[2][:, :2], axis=1)
+        rows[name] = [*metrics, replace(metrics[0], name="seconds", value=e.seconds, unit="s")]
+    names = [m.name for m in rows["graph"]]
+    click.echo(f"{'':<34} {'graph':>12} {'thesis':>12}")
+    theirs_by_name = {m.name: m for m in rows["thesis"]}
+    for m in rows["graph"]:
+        other = theirs_by_name.get(m.name)
+        click.echo(f"{m.name:<34} {show(m):>12} {show(other) if other else '–':>12}")
+    del names
+    if errors:
+        (folder / "comparison.png").write_bytes(report.comparison_figure(errors))
+    flat = [replace(m, name=f"{k}: {m.name}") for k, ms in rows.items() for m in ms]
+    report.write_json(
+        folder / "report.json", flat, run.skipped, [{"path": p.name, "sha256": _hash(p)} for p in bags],
+        solved.seconds, _peak_mb(), notes=run.notes, versions=_versions(),
+    )  # fmt: skip
+    click.echo(f"written: {folder}")
+
+
+@main.command()
+@click.argument("bags", nargs=-1, required=True, type=click.Path(path_type=Path))
+@_input_options
+def inspect(bags: tuple[Path, ...], config_file: Path | None, **words: Any) -> None:
+    """Say what BAGS hold: topics, types, counts, which stream is taken for what, sensor frames."""
+    from topograph.bags import Recording, topics
+
+    config = _config(config_file, words)
+    try:
+        recording = Recording(bags, config.bags)
+        with recording:
+            chosen, frames = recording.chosen, recording.frames
+            types, counts, duration = dict(recording.types), recording.counts, recording.duration_s
+    finally:
+        for topic, kind in sorted(recording.types.items()):
+            click.echo(f"  {topic:<36} {kind:<44} {recording.counts[topic]:>9}")
+    click.echo(f"{', '.join(map(str, bags))}: {duration:.1f} s, {len(types)} topics, {sum(counts.values())} messages")
+    for kind in topics.KINDS:
+        click.echo(f"  {kind:<10} {chosen.get(kind, '– (none)')}")
+    click.echo(f"  frames known from {frames.base}: {', '.join(frames.names()) or 'none'}")
+
+
+@main.command()
+@click.argument("bags", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="One row per trunk and scan.")
+@click.option("--picture", type=click.Path(path_type=Path), help="PNG of a scan with its trunks.")
+@click.option("--at", "at_s", type=float, default=None, help="Seconds into the run of the scan that is drawn (default: the middle).")
+@click.option("--truth", type=click.Path(path_type=Path), help="Folder of simulated truth: precision and recall by range.")
+@click.option("--results", type=click.Path(path_type=Path), help="Folder for report.json.")
+@click.option("-q", "--quiet", is_flag=True, help="No progress.")
+@_input_options
+def detect(
+    bags: tuple[Path, ...], csv_file: Path | None, picture: Path | None, at_s: float | None, truth: Path | None,
+    results: Path | None, quiet: bool, config_file: Path | None, **words: Any,
+) -> None:  # fmt: skip
+    """Find trunks in the scans of BAGS: counts, rate, a table by range, a picture."""
+    from topograph import pipeline, report
+    from topograph.evaluate import Metric, trunk_metrics
+    from topograph.geometry import inverse, transform
+    from topograph.report.record import write_text
+
+    config = _config(config_file, words)
+    true = _truth(truth, bags)
+    with _progress(quiet) as progress:
+        run = pipeline.read_run(bags, config, progress)
+    if run.scans == 0:
+        raise InputError("no point cloud and no trunk detections; name a topic with --topic-points or --topic-trunks")
+    trunks = sorted(run.trunks, key=lambda t: t.stamp_ns)
+    n = sum(map(len, trunks))
+    click.echo(f"{run.scans} scans, {n} trunks ({n / run.scans:.1f} a scan), {run.seconds:.1f} s, {run.duration_s / run.seconds:.1f} × real time")
+    metrics = [Metric("scans", run.scans), Metric("trunks", n), Metric("real-time factor", run.duration_s / run.seconds, "", "higher")]
+    reach = np.concatenate([np.hypot(t.p[:, 0], t.p[:, 1]) for t in trunks])
+    if true is None:
+        for low, high in ((0, 5), (5, 10), (10, 20), (20, 30)):
+            click.echo(f"  {low:>2}-{high:<2} m {int(((reach >= low) & (reach < high)).sum()):>8}")
+    else:
+        found, table = trunk_metrics(true, np.array([t.stamp_ns for t in trunks]), [t.p for t in trunks])
+        metrics += found
+        click.echo("  range     visible   found  precision  recall  radial bias ± sd   across sd")
+        for r in table:
+            click.echo(
+                f"  {r['from']:>2.0f}-{r['to']:<2.0f} m {r['visible']:>9.0f} {r['found']:>7.0f} {r['precision']:>10.3f} "
+                f"{r['recall']:>7.3f} {100 * r['radial_bias']:>8.1f} ± {100 * r['radial_sd']:.1f} cm {100 * r['tangential_sd']:>7.1f} cm"
+            )
+    if csv_file is not None:
+        lines = ["stamp,x,y,z,height,diameter,score"]
+        for t in trunks:
+            stamp = f"{t.stamp_ns // 10**9}.{t.stamp_ns % 10**9:09d}"
+            lines += [
+                f"{stamp},{p[0]:.4f},{p[1]:.4f},{p[2]:.4f},{h:.3f},{d:.4f},{s:.3f}"
+                for p, h, d, s in zip(t.p, t.height, t.diameter, t.score, strict=True)
+            ]
+        write_text(csv_file, "\n".join(lines) + "\n")
+    if picture is not None:
+        at = trunks[0].stamp_ns + int(1e9 * (0.5 * run.duration_s if at_s is None else at_s))
+        scan, mount, shown = pipeline.scan_near(bags, config, at, trunks)
+        feet = None
+        if true is not None:
+            from topograph.geometry import interpolate
+
+            feet = transform(inverse(interpolate(true.stamps_ns, true.world_T_robot, [scan.stamp_ns])[0]), true.trees)[:, :2]
+        picture.write_bytes(report.scan_figure(scan, mount, shown, feet))
+    if results is not None:
+        results.mkdir(parents=True, exist_ok=True)
+        inputs = [{"path": p.name, "sha256": _hash(p)} for p in bags]
+        report.write_json(results / "report.json", metrics, run.skipped, inputs, {"read": run.seconds}, _peak_mb(), notes=run.notes)
+
+
+@main.command()
+@click.argument("output", type=click.Path(path_type=Path))
+@click.option("--design", default="grid", show_default=True, help="grid, olive, steep, gentle or hedgerow.")
+@click.option("--seed", type=int, default=1, show_default=True)
+@click.option("--run", "number", type=click.IntRange(1, 3), default=1, show_default=True,
+              help="1: rows downhill and back; 2: the other way; 3: zigzag (thesis 5.3).")  # fmt: skip
+@click.option("--gnss", type=click.Choice(["rtk", "float", "degraded", "none"]), default="rtk", show_default=True)
+@click.option("--rings", type=click.Choice(["16", "32", "64", "128"]), default="16", show_default=True)
+@click.option("--sweep-hz", type=float, default=10.0, show_default=True)
+@click.option("--stop-every", type=float, default=0.0, help="Stop and go, as in the thesis: metres between stops.")
+@click.option("--longest", type=float, default=3600.0, help="Cut the drive after so many seconds.")
+@click.option("--laps", type=int, default=1)
+@click.option("--compression", type=click.Choice(["none", "lz4", "zstd"]), default="none")
+@click.option("--detections", is_flag=True, help="Write trunk detections in place of clouds (fast).")
+@click.option("-q", "--quiet", is_flag=True, help="No progress.")
+def simulate(
+    output: Path, design: str, seed: int, number: int, gnss: str, rings: str, sweep_hz: float, stop_every: float,
+    longest: float, laps: int, compression: str, detections: bool, quiet: bool,
+) -> None:  # fmt: skip
+    """Write a simulated run to OUTPUT (.bag: ROS 1; otherwise a ROS 2 folder with mcap), truth in <OUTPUT>.truth."""
+    from topograph.simulate import DESIGNS, DriveConfig, SensorConfig, record
+
+    if design not in DESIGNS:
+        raise UsageError(f"--design {design}: known are {', '.join(DESIGNS)}")
+    if (compression == "lz4" and output.suffix != ".bag") or (compression == "zstd" and output.suffix == ".bag"):
+        raise UsageError(f"--compression {compression}: lz4 is for .bag, zstd for mcap")
+    sensor = SensorConfig(gnss=gnss, rings=int(rings), sweep_hz=sweep_hz, detections=detections, compression=compression)
+    drive = DriveConfig(run=number, stop_every=stop_every, longest_s=longest, laps=laps)
+    with _progress(quiet) as progress:
+        truth = record(output, seed, design, drive, sensor, progress=lambda share: progress("simulate", share))
+    span = (truth.stamps_ns[-1] - truth.stamps_ns[0]) * 1e-9
+    click.echo(f"{output}: {span:.0f} s, {len(truth.trees)} trees; truth in {output.with_name(output.stem + '.truth')}")
+
+
+@main.command()
+@click.argument("folder", type=click.Path(path_type=Path), default=Path("demo"))
+@click.option("--seed", type=int, default=7, show_default=True)
+@click.option("-q", "--quiet", is_flag=True, help="No progress.")
+def demo(folder: Path, seed: int, quiet: bool) -> None:
+    """Simulate an orchard, map it, and write a page to look at, in FOLDER."""
+    import shutil
+
+    from topograph import pipeline
+    from topograph.config import Config
+    from topograph.simulate import DriveConfig, SensorConfig, record
+
+    bag = folder / "run1.bag"
+    folder.mkdir(parents=True, exist_ok=True)
+    for old in (bag, folder / "run1.truth"):
+        shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
+    with _progress(quiet) as progress:
+        truth = record(
+            bag, seed, "olive", DriveConfig(run=1), SensorConfig(sweep_hz=10.0, columns=1808),
+            progress=lambda share: progress("simulate", share),
+        )  # fmt: skip
+        config = Config()
+        run = pipeline.read_run([bag], config, progress)
+        solved = pipeline.solve_run(run, config, progress=progress)
+        topo = _save_results(solved, config, [bag], folder, folder / "orchard.gpkg", truth, None, progress)
+    from topograph.evaluate import map_metrics
+
+    _table(map_metrics(topo, truth))
+    click.echo(f"look at {folder / 'report.html'} (browser), {folder / 'orchard.gpkg'} (QGIS), {folder / 'map.png'}")
+
+
+@main.command()
+@click.argument("map_file", type=click.Path(path_type=Path))
+@click.argument("output", type=click.Path(path_type=Path))
+def export(map_file: Path, output: Path) -> None:
+    """Write MAP_FILE's trees as .geojson or .csv, its path as .tum, or its clouds as .ply."""
+    from topograph import store
+    from topograph.report.export import write
+
+    write(store.load(map_file, clouds=output.suffix == ".ply"), output)
+    click.echo(f"written: {output}")
+
+
+@main.command()
+@click.argument("map_file", type=click.Path(path_type=Path))
+@click.argument("output", type=click.Path(path_type=Path), default=Path("map.html"))
+def view(map_file: Path, output: Path) -> None:
+    """Write a self-contained page of MAP_FILE to open in a browser."""
+    from topograph import report, store
+    from topograph.evaluate.metrics import Metric, doubles
+
+    topo = store.load(map_file, clouds=False)
+    metrics = [Metric("trees", len(topo)), Metric("edges", len(topo.edges)), doubles(topo)]
+    notes = [] if topo.datum is not None else ["not georeferenced: the frame is the first pose of the run"]
+    report.write_page(output, map_file.name, topo, metrics, {}, {}, notes, {"schema": "1"})
+    click.echo(f"written: {output}")
+
+
+@main.command("config")
+@click.option("-c", "--config", "config_file", type=click.Path(path_type=Path), help="Check this file and fill in the rest.")
+def config_command(config_file: Path | None) -> None:
+    """Print the whole configuration as YAML."""
+    from topograph.config import dump, load
+
+    click.echo(dump(load(config_file)), nl=False)
+
+
+if __name__ == "__main__":
+    main()

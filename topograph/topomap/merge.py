@@ -1,0 +1,52 @@
+"""A further run's map into an older one of the same frame."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from topograph.geometry import Array
+from topograph.topomap.edges import TopomapConfig, neighbours
+from topograph.topomap.map import TopoMap, Viewpoint
+from topograph.topomap.rows import find_rows
+
+
+def merge(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64], config: TopomapConfig) -> TopoMap:
+    """`tree_of_old` (T_old,) is the row in `new` that each old tree was seen as, or -1.
+
+    The new run was solved with the old trees as priors, so its values for them are the joint ones. Ids of old trees
+    stay; sightings add up; of two viewpoints from the same side the fuller one is kept.
+    """
+    seen = tree_of_old >= 0
+    fresh = np.setdiff1d(np.arange(len(new)), tree_of_old[seen])
+
+    def both(name: str) -> Array:
+        a, b = np.array(getattr(old, name)), getattr(new, name)
+        a[seen] = b[tree_of_old[seen]]
+        return np.concatenate([a, b[fresh]])
+
+    p = both("p")
+    sightings = np.concatenate([old.sightings, new.sightings[fresh]])
+    sightings[: len(old)][seen] += new.sightings[tree_of_old[seen]]
+    ids = np.concatenate([old.ids, int(old.ids.max(initial=0)) + 1 + np.arange(len(fresh))])
+    row_of_new = np.full(len(new), -1)
+    row_of_new[tree_of_old[seen]] = np.flatnonzero(seen)
+    row_of_new[fresh] = len(old) + np.arange(len(fresh))
+    views = list(old.viewpoints)
+    for v in new.viewpoints:
+        moved = Viewpoint(int(row_of_new[v.tree]), v.direction, v.cloud)
+        twin = [
+            i for i, o in enumerate(views) if o.tree == moved.tree and float(o.direction @ v.direction) > config.viewpoint_cosine
+        ]
+        if not twin:
+            views.append(moved)
+        elif len(v.cloud) > len(views[twin[0]].cloud):
+            views[twin[0]] = moved
+    edges = neighbours(p[:, :2], config)
+    stamps = np.concatenate([old.stamps_ns, new.stamps_ns])
+    poses = np.concatenate([old.map_T_robot, new.map_T_robot])
+    return TopoMap(
+        old.datum, ids.astype(np.int64), p, both("cov"), both("axis"), both("diameter"), both("first_branch"), sightings,
+        both("score"), find_rows(p[:, :2], poses[:, :2, 3]), edges, np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1),
+        tuple(views), stamps, poses, old.datum_cov, new.meta,
+    )  # fmt: skip

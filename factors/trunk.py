@@ -55,7 +55,7 @@ def trunks(pose_keys: list[int], point_keys: list[int], robot_p_trunk: Array, co
 
 def bearing_basis(unit: Array) -> Array:
     """Tangent basis (N, 3, 2) that gtsam.Unit3 uses at directions (N, 3): across the least of the axes."""
-    least = np.abs(unit).argmin(axis=1)
+    least = np.abs(np.round(unit, 12)).argmin(axis=1)  # rounding must not decide between equal axes
     first = np.cross(unit, np.eye(3)[least])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     second = np.cross(unit, first)

@@ -24,7 +24,7 @@ from topograph.trunks.config import TrunksConfig
 from topograph.trunks.detector import RANGE_EDGES, candidates
 from topograph.trunks.fit import FEATURES
 
-HIDDEN = 14
+HIDDEN = 24
 
 
 def collect(folder: Path, every: int):
@@ -96,12 +96,12 @@ def train(X, y, ridge=2e-4):
         grad = np.concatenate([(X.T @ gh).ravel(), gh.sum(0), (h.T @ g).ravel(), g.sum(0)])
         return value, grad + 2 * ridge * w
 
-    result = minimize(loss, w0, jac=True, method="L-BFGS-B", options={"maxiter": 600})
+    result = minimize(loss, w0, jac=True, method="L-BFGS-B", options={"maxiter": 900})
     return unpack(result.x, f), result.fun
 
 
 def main(train_dir: Path, validation_dir: Path) -> None:
-    X, y, fits, errors = collect(train_dir, 4)
+    X, y, fits, errors = collect(train_dir, 3)
     mean, deviation = X.mean(0), X.std(0) + 1e-6
     sure = np.isfinite(y)  # pieces beside a trunk are neither
     X, y, fits, errors = X[sure], y[sure], fits[sure], errors[sure]

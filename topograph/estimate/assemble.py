@@ -47,10 +47,32 @@ def assemble(
     odom = motion.at(keyframes_ns)
     fixes = _fixes(keyframes_ns, odom, motion, streams, used_fixes, robot_T_antenna, datum, config, skipped)
     headings = _headings(keyframes_ns, odom, motion, streams, robot_T_baseline, datum)
+    up, up_sigma = _mean_axes(keyframes_ns, detections)
     return Problem(
         keyframes_ns, odom, motion.sigma(motion_config, keyframes_ns), motion, motion_config, inertial, fixes, headings,
-        datum, detections, empty_sightings(), 0,
+        datum, detections, empty_sightings(), 0, up=up, up_sigma=up_sigma,
     )  # fmt: skip
+
+
+def _mean_axes(keyframes_ns: Stamps, detections: Detections, least: int = 10, lean: float = 0.1) -> tuple[Array, Array]:
+    """Mean trunk axis (K, 3) at each keyframe and its deviation (K,): trees grow upwards, within their lean.
+
+    NaN with fewer than `least` trunks, and everywhere when the axes are not measured (all alike).
+    """
+    n = len(keyframes_ns)
+    up, sigma = np.full((n, 3), np.nan), np.full(n, np.nan)
+    if not len(detections) or detections.axis[:, :2].std() < 1e-3:
+        return up, sigma
+    keyframe = nearest_keyframe(detections.stamps_ns, keyframes_ns)[detections.scan]
+    order = np.argsort(keyframe, kind="stable")
+    ends = np.searchsorted(keyframe[order], np.arange(n + 1))
+    for k in range(n):
+        mine = order[ends[k] : ends[k + 1]]
+        if len(mine) >= least:
+            mean = np.median(detections.axis[mine], axis=0)
+            up[k] = mean / np.linalg.norm(mean)
+            sigma[k] = np.hypot(0.012, lean / np.sqrt(len(mine)))
+    return up, sigma
 
 
 def _at_keyframes(keyframes_ns: Stamps, odom: Array, motion: Motion, stamps: Stamps) -> tuple[NDArray[np.int64], Array]:

@@ -8,7 +8,7 @@ whose linear system also gives the covariances. Odometry and IMU are never robus
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
@@ -23,6 +23,7 @@ from topograph.estimate.inertia import Inertia, inertia
 from topograph.estimate.problem import Estimate, EstimateConfig, Problem
 from topograph.estimate.solver import levenberg_marquardt, with_big_stack
 from topograph.geometry import Array, inverse, log, transform, wrap
+from topograph.trees import Sightings
 
 X, V, B, L = (gtsam.symbol(c, 0) for c in "xvbl")
 _NONE = Kernel("none")
@@ -53,9 +54,11 @@ def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False) -> E
     trees = _median_trees(problem, poses)
     huber = Kernel("huber", config.huber)
     inert = None if quick or not config.use_imu else inertia(problem)
+    if quick:
+        problem = replace(problem, sightings=_nearest(problem.sightings, 25))
     values = _values(problem, poses, trees, inert)
     first = _Pass(huber, huber, 0.05 if quick else 0.0)
-    values = levenberg_marquardt(_graph(problem, first, config, inert), values, 8 if quick else config.iterations, 1e-3 if quick else 1e-4)
+    values = levenberg_marquardt(_graph(problem, first, config, inert), values, 10 if quick else 3 * config.iterations, 1e-3 if quick else 1e-6)
     if quick:
         return _estimate(problem, config, values, first, None, time.perf_counter() - began)
     scales = _learned_scales(problem, values, first) if config.learn_scale else (1.0, 1.0)
@@ -64,6 +67,22 @@ def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False) -> E
     values = levenberg_marquardt(_graph(problem, last, config, inert), values, config.iterations)
     values, linear = with_big_stack(lambda: _polish(problem, last, config, inert, values))
     return _estimate(problem, config, values, last, linear, time.perf_counter() - began)
+
+
+def _nearest(s: Sightings, most: int) -> Sightings:
+    """At most `most` sightings of each keyframe, the surest first; and at least two of each tree."""
+    size = np.trace(s.cov, axis1=1, axis2=2)
+    order = np.lexsort((size, s.keyframe))
+    rank = np.empty(len(s), np.int64)
+    keyframe = s.keyframe[order]
+    first = np.searchsorted(keyframe, keyframe, side="left")
+    rank[order] = np.arange(len(s)) - first
+    by_tree = np.lexsort((size, s.tree))
+    tree = s.tree[by_tree]
+    rank_in_tree = np.empty(len(s), np.int64)
+    rank_in_tree[by_tree] = np.arange(len(s)) - np.searchsorted(tree, tree, side="left")
+    keep = (rank < most) | (rank_in_tree < 2)
+    return Sightings(s.keyframe[keep], s.tree[keep], s.p[keep], s.cov[keep], s.count[keep])
 
 
 def _poses_alone(problem: Problem, poses: Array, config: EstimateConfig) -> Array:
@@ -151,21 +170,34 @@ def _add_motion(g: Any, problem: Problem, inert: Inertia | None) -> None:
     if problem.inertial is None:
         for k in range(0, n, 10):
             g.add(factors.level(X + k, 0.3))
+        if problem.up is not None and problem.up_sigma is not None:
+            for k in np.flatnonzero(np.isfinite(problem.up_sigma)).tolist():
+                g.add(factors.level(X + k, float(problem.up_sigma[k]), problem.up[k]))
     elif inert is None:  # quick passes: the complementary filter's attitude stands in for the IMU factors
         for k in range(0, n, 5):
             up = problem.odom_T_robot[k, 2, :3]
-            g.add(
-                gtsam.AttitudeFactorPose3(X + k, gtsam.Unit3(0, 0, 1), factors.sigmas([0.02, 0.02]), gtsam.Unit3(up))
-            )
+            g.add(factors.level(X + k, 0.02, up))
     if inert is not None:
         inert.add_to(g, X, V, B)
 
 
 def _add_fixes(g: Any, problem: Problem, p: _Pass, config: EstimateConfig) -> None:
+    """Each fix twice: its horizontal part and its height, each under a loss of its own.
+
+    Heights fail by tens of metres while positions are sound (a receiver that has just started): one must not take
+    the other with it.
+    """
     f = problem.fixes
     cov = _fix_cov(problem, p, config)
-    for k, lever, z, c in zip(f.keyframe.tolist(), f.keyframe_p_antenna, f.map_p_antenna, cov, strict=True):
-        g.add(factors.fix(X + k, z, lever, c, p.fix))
+    free = 1e6
+    flat, tall = cov.copy(), np.zeros_like(cov)
+    flat[:, 2, :2] = flat[:, :2, 2] = 0.0
+    flat[:, 2, 2] = free
+    tall[:, 0, 0] = tall[:, 1, 1] = free
+    tall[:, 2, 2] = cov[:, 2, 2]
+    for part in (flat, tall):
+        for k, lever, z, c in zip(f.keyframe.tolist(), f.keyframe_p_antenna, f.map_p_antenna, part, strict=True):
+            g.add(factors.fix(X + k, z, lever, c, p.fix))
 
 
 def _fix_cov(problem: Problem, p: _Pass, config: EstimateConfig) -> Array:

@@ -98,6 +98,8 @@ class Problem:
         pose_sigma: when the path is known beforehand (`start`), its deviation (m, rad); else None.
         start: (K, 4, 4) first guess of `map_T_robot`, or None.
         known: trees that an earlier map knows, or None.
+        up: (K, 3) mean axis of the trunks at each keyframe, in its base frame; NaN where there are too few.
+        up_sigma: (K,) rad.
     """
 
     stamps_ns: Stamps
@@ -115,6 +117,8 @@ class Problem:
     pose_sigma: float | None = None
     start: Array | None = None
     known: KnownTrees | None = None
+    up: Array | None = None
+    up_sigma: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,8 +39,8 @@ class TreesConfig:
     mapped: float = 0.6
     margin: float = 7.0
     merge: float = 0.7
-    min_sightings: int = 4
-    min_score: float = 0.0
+    min_sightings: int = 6
+    min_score: float = 1.15
     min_ratio: float = 0.15
 
 

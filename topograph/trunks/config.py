@@ -18,7 +18,8 @@ class TrunksConfig:
         prior_diameter, prior_sigma: of trunks too coarsely seen to measure.
         min_score: log-odds below which a candidate is dropped.
         recorded_sigma, recorded_growth, recorded_along: first guess of the noise of recorded detections: at the
-            sensor, per metre of range, and along the axis.
+            sensor, per metre of range, and along the axis (where on the trunk a detection lies is not stated, and
+            in recordings it moves with the sensor's height: next to no information).
         recorded_reach: recorded detections beyond are left out.
     """
 
@@ -35,5 +36,5 @@ class TrunksConfig:
     min_score: float = 0.0
     recorded_sigma: float = 0.05
     recorded_growth: float = 0.01
-    recorded_along: float = 0.3
+    recorded_along: float = 5.0
     recorded_reach: float = 40.0

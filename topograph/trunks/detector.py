@@ -12,7 +12,7 @@ from topograph.bags import Scan, Trunks
 from topograph.geometry import Array
 from topograph.trunks import score as scoring
 from topograph.trunks.config import TrunksConfig
-from topograph.trunks.fit import fit_chains, suppress
+from topograph.trunks.fit import FEATURES, fit_chains, suppress
 from topograph.trunks.ground import fit_ground
 from topograph.trunks.organise import angular_step, organise, rings_of
 from topograph.trunks.runs import FIRST, LAST, find_runs, heights, link
@@ -42,14 +42,14 @@ def candidates(scan: Scan, base_T_lidar: Array, twist: Array, config: TrunksConf
     `twist` (6,) is the base's linear (m/s) and angular (rad/s) velocity during the sweep.
     """
     if len(scan.xyz) == 0:
-        return Candidates(np.zeros((0, 16)), np.zeros((0, 18)), np.zeros((0, 3), np.float32), [])
+        return Candidates(np.zeros((0, 16)), np.zeros((0, len(FEATURES))), np.zeros((0, 3), np.float32), [])
     ring, n_rings = rings_of(scan)
     offset = _NO_TIME if scan.offset is None else scan.offset
     p, r, a, starts = organise(
         scan.xyz, ring, offset, base_T_lidar, np.asarray(twist, float), n_rings, config.nearest, config.farthest + 8.0
     )
     if len(p) < 50:
-        return Candidates(np.zeros((0, 16)), np.zeros((0, 18)), p, [])
+        return Candidates(np.zeros((0, 16)), np.zeros((0, len(FEATURES))), p, [])
     step = angular_step(a, starts)
     plane, grid = fit_ground(p)
     h, above, beside = heights(p, plane, grid)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from topograph.trunks.ground import HALF, ground_at
-from topograph.trunks.runs import COUNT, FIRST, FREE, HEIGHT, LAST, PX, PY, PZ, RANGE, RING, WIDTH
+from topograph.trunks.ground import ground_at
+from topograph.trunks.runs import COUNT, FIRST, FREE, HEIGHT, LAST, PX, PY, PZ, RANGE, RING, WIDTH, count_around
 
 FEATURES = (
     "range", "rings", "points", "diameter", "width_spread", "rough", "line_rms", "lean", "free", "lowest", "highest",
-    "canopy", "undergrowth", "top_visible", "fill", "taper", "depth_slope", "ring_gap",
+    "canopy", "undergrowth", "top_visible", "fill", "taper", "depth_slope", "ring_gap", "overhead", "close_by",
 )  # fmt: skip
 OUT_SIZE = 16
 """x, y, z, axis (3), diameter, height, radial and tangential sigma, lean sigma, points, rings, range, bearing x, y."""
@@ -26,7 +26,7 @@ def fit_chains(p, r, h, runs, label, chain, plane, grid, above, beside, eye, ste
     """
     k = runs.shape[0]
     out = np.empty((k, OUT_SIZE))
-    feature = np.empty((k, 18))
+    feature = np.empty((k, 20))
     name = np.empty(k, np.int64)
     n_out = 0
     members = np.empty(k, np.int64)
@@ -140,13 +140,8 @@ def fit_chains(p, r, h, runs, label, chain, plane, grid, above, beside, eye, ste
         d = np.sqrt((px - eye[0]) ** 2 + (py - eye[1]) ** 2)
         row[14], row[15] = (px - eye[0]) / d, (py - eye[1]) / d
         # Features.
-        gx, gy = int(np.floor(px - 0.5)) + HALF, int(np.floor(py - 0.5)) + HALF
-        canopy, under = 0, 0
-        for a in range(gx, gx + 2):
-            for b in range(gy, gy + 2):
-                if 0 <= a < 2 * HALF and 0 <= b < 2 * HALF:
-                    canopy += above[a, b]
-                    under += beside[a, b]
+        overhead, canopy = count_around(above, px + lx, py + ly, 0.4, 1.5)
+        close_by, under = count_around(beside, px, py, 0.5, 1.3)
         f = feature[n_out]
         seen_top = eye[2] + d * np.tan(top) - ground
         upper, lower, nu, nl = 0.0, 0.0, 0.0, 0.0
@@ -165,12 +160,14 @@ def fit_chains(p, r, h, runs, label, chain, plane, grid, above, beside, eye, ste
         f[7] = np.sqrt(lx * lx + ly * ly)
         f[8] = free / (2.0 * n)
         f[9], f[10] = lowest, highest
-        f[11], f[12] = np.log(1.0 + canopy), np.log(1.0 + max(under - points, 0.0))
+        f[11], f[12] = np.log(1.0 + canopy), np.log(1.0 + under)
         f[13] = min(seen_top, 5.0)
         f[14] = points * step * far / max(n * measured, 0.03)
         f[15] = (upper / nu - lower / nl) if nu > 0 and nl > 0 else 0.0
         f[16] = (runs[last, RANGE] - runs[first, RANGE]) / max(highest - lowest, 0.3)
         f[17] = (runs[last, RING] - runs[first, RING] + 1.0) / n
+        f[18] = np.log(1.0 + overhead)
+        f[19] = np.log(1.0 + max(close_by - points, 0.0))
         name[n_out] = c
         n_out += 1
     return out[:n_out], feature[:n_out], name[:n_out]

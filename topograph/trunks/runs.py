@@ -12,24 +12,46 @@ FIRST, LAST, RING, PX, PY, PZ, RANGE, WIDTH, FREE, HEIGHT, COUNT, BEARING = rang
 RUN_SIZE = 12
 
 
+CELLS = 8 * HALF
+"""Cells of 0.25 m across the grids of canopy and undergrowth."""
+
+
 @njit(cache=True)
 def heights(p, plane, grid):  # type: ignore[no-untyped-def]
-    """Height above ground (M,) of points; and counts of canopy (1.8-5 m) and of undergrowth (0.3-1.5 m) per 1 m cell."""
+    """Height above ground (M,) of points; counts of what is overhead (1.9-5 m) and beside (0.3-1.5 m) per 0.25 m cell."""
     m = p.shape[0]
     h = np.empty(m, np.float32)
-    size = 2 * HALF
-    above = np.zeros((size, size), np.int32)
-    beside = np.zeros((size, size), np.int32)
+    above = np.zeros((CELLS, CELLS), np.int32)
+    beside = np.zeros((CELLS, CELLS), np.int32)
     for i in range(m):
         x, y = p[i, 0], p[i, 1]
         h[i] = p[i, 2] - ground_at(x, y, plane, grid)
-        a, b = int(np.floor(x)) + HALF, int(np.floor(y)) + HALF
-        if 0 <= a < size and 0 <= b < size:
-            if 1.8 < h[i] < 5.0:
+        a, b = int(4.0 * (x + HALF)), int(4.0 * (y + HALF))
+        if 0 <= a < CELLS and 0 <= b < CELLS:
+            if 1.9 < h[i] < 5.0:
                 above[a, b] += 1
             elif 0.3 < h[i] < 1.5:
                 beside[a, b] += 1
     return h, above, beside
+
+
+@njit(cache=True)
+def count_around(cells, x, y, inner, outer):  # type: ignore[no-untyped-def]
+    """Points within `inner` m, and between `inner` and `outer` m, of a position."""
+    i, j = int(4.0 * (x + HALF)), int(4.0 * (y + HALF))
+    near, far = 0, 0
+    k = int(4.0 * outer) + 1
+    for a in range(max(i - k, 0), min(i + k + 1, CELLS)):
+        for b in range(max(j - k, 0), min(j + k + 1, CELLS)):
+            if cells[a, b] == 0:
+                continue
+            dx, dy = 0.25 * (a + 0.5) - HALF - x, 0.25 * (b + 0.5) - HALF - y
+            d2 = dx * dx + dy * dy
+            if d2 < inner * inner:
+                near += cells[a, b]
+            elif d2 < outer * outer:
+                far += cells[a, b]
+    return near, far
 
 
 @njit(cache=True)

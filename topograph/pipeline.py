@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from topograph.bags import Recording, Scan, Trunks
 from topograph.config import Config
 from topograph.errors import InputError, InsufficientDataError
-from topograph.estimate import Estimate, KnownTrees, Problem, average, graph, path_at
+from topograph.estimate import Estimate, KnownTrees, Link, Problem, average, graph, path_at
 from topograph.estimate.assemble import assemble, choose_datum
 from topograph.evaluate import Metric, fix_metrics
 from topograph.geometry import Array, inverse, transform
@@ -29,6 +29,7 @@ from topograph.trees import (
     exists,
     follow,
     gather,
+    moved_pose,
     refine,
     tabulate,
 )
@@ -286,11 +287,13 @@ class _Association:
             np.concatenate([t.hits, np.full(self.known, 1000)]),
         )
 
-    def solve(self, e: Estimate, *, least: int = 3) -> Estimate:
-        """A quick estimate with the trees as they are now."""
+    def solve(self, e: Estimate, *, least: int = 3, patient: bool = False, link: Link | None = None) -> Estimate:
+        """An estimate without covariances of the trees as they are now; `patient`: until it has converged."""
+        if link is not None:  # pull the loop shut with the trees as they were, then join them
+            e = graph.solve(replace(self.problem, start=e.map_T_robot, link=link), self.config.estimate, quick=True, patient=True)
         self.problem, _, _ = self.with_trees(self.tree_of_track, least)
         self.problem = replace(self.problem, start=e.map_T_robot)
-        return graph.solve(self.problem, self.config.estimate, quick=True)
+        return graph.solve(self.problem, self.config.estimate, quick=True, patient=patient)
 
     def with_trees(
         self, tree_of_track: NDArray[np.int64], least: int, keep: NDArray[np.bool_] | None = None
@@ -327,14 +330,15 @@ def _associate_and_solve(
     while a.closer.advance(a.table(estimate), end, cap):
         progress("associate", min(1.0, a.closer.at / max(end, 1e-9)))
         a.tree_of_track = a.closer.tree
-        estimate = a.solve(estimate)
+        estimate = a.solve(estimate, link=_link(problem, estimate, a.closer))
     progress("associate", 1.0)
     a.tree_of_track = a.closer.tree
-    for n in range(3):
+    estimate = a.solve(estimate, patient=True)
+    for n, patience in enumerate((4.0, 2.0, 1.0)):
         progress("refine", n / 3)
         t = a.table(estimate)
-        a.tree_of_track = refine(t.place, t.sigma, t.hits, a.tree_of_track, config.trees)
-        estimate = a.solve(estimate)
+        a.tree_of_track = refine(t.place, t.sigma, t.hits, a.tree_of_track, config.trees, patience)
+        estimate = a.solve(estimate, patient=True)
     t = a.table(estimate)
     a.tree_of_track = refine(t.place, t.sigma, t.hits, a.tree_of_track, config.trees)
     problem, tree, ids = a.with_trees(a.tree_of_track, 1)
@@ -354,6 +358,19 @@ def _associate_and_solve(
     progress("solve", 1.0)
     place = np.searchsorted(ids, final)
     return tree, problem, replace(estimate, tree=tree), score[place], hits[place], int((~ok).sum()), a.closer.loops
+
+
+def _link(problem: Problem, estimate: Estimate, closer: LoopCloser) -> Link | None:
+    """The loop just closed as one relative pose: it pulls the path over distances at which robust losses let go."""
+    if closer.link is None:
+        return None
+    before, now, centre, move = closer.link
+    distance = problem.motion.distance_at(problem.stamps_ns)
+    a, b = (int(np.clip(np.searchsorted(distance, d), 0, len(distance) - 1)) for d in (before, now))
+    if a == b:
+        return None
+    poses = estimate.map_T_robot
+    return Link(a, b, inverse(poses[a]) @ moved_pose(poses[b], centre, move))
 
 
 def _gnss_cap(problem: Problem, closer: LoopCloser) -> float:

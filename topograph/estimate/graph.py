@@ -40,8 +40,9 @@ class _Pass:
     fix_scale: float = 1.0
 
 
-def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False) -> Estimate:
-    """Path and trees of a run. `quick` stops after the Huber pass and gives no covariances (for association).
+def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False, patient: bool = False) -> Estimate:
+    """Path and trees of a run. `quick` stops after a Huber pass of few steps and gives no covariances (for association);
+    with `patient` that pass runs until it has converged.
 
     Raises:
         InsufficientDataError: the data do not determine the path.
@@ -58,7 +59,8 @@ def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False) -> E
         problem = replace(problem, sightings=_nearest(problem.sightings, 25))
     values = _values(problem, poses, trees, inert)
     first = _Pass(huber, huber, 0.05 if quick else 0.0)
-    values = levenberg_marquardt(_graph(problem, first, config, inert), values, 10 if quick else 3 * config.iterations, 1e-3 if quick else 1e-6)
+    steps, tolerance = (10, 1e-3) if quick and not patient else (3 * config.iterations, 1e-5 if quick else 1e-6)
+    values = levenberg_marquardt(_graph(problem, first, config, inert), values, steps, tolerance)
     if quick:
         return _estimate(problem, config, values, first, None, time.perf_counter() - began)
     scales = _learned_scales(problem, values, first) if config.learn_scale else (1.0, 1.0)
@@ -122,6 +124,9 @@ def _graph(problem: Problem, p: _Pass, config: EstimateConfig, inert: Inertia | 
     g = gtsam.NonlinearFactorGraph()
     _add_motion(g, problem, inert)
     _add_fixes(g, problem, p, config)
+    if problem.link is not None:
+        sigma = [0.1, 0.1, 0.02, 0.2, 0.2, 0.5]
+        g.add(factors.odometry(X + problem.link.a, X + problem.link.b, _orthonormal(problem.link.a_T_b), sigma))
     for k, direction, yaw, sigma in zip(
         problem.headings.keyframe.tolist(), problem.headings.direction, problem.headings.yaw, problem.headings.sigma, strict=True
     ):
@@ -165,7 +170,8 @@ def _add_motion(g: Any, problem: Problem, inert: Inertia | None) -> None:
         g.add(f)
     georeferenced = len(problem.fixes.keyframe) >= 3
     first = factors.to_pose3(_orthonormal(problem.start[0] if problem.start is not None else problem.odom_T_robot[0]))
-    loose = [10.0, 10.0, 10.0, 1e4, 1e4, 1e4] if georeferenced else [0.03, 0.03, 1e-3, 1e-3, 1e-3, 1e-3]
+    tilt = 0.3 if problem.up_sigma is not None and np.isfinite(problem.up_sigma).any() else 0.03
+    loose = [10.0, 10.0, 10.0, 1e4, 1e4, 1e4] if georeferenced else [tilt, tilt, 1e-3, 1e-3, 1e-3, 1e-3]
     g.add(gtsam.PriorFactorPose3(X, first, factors.sigmas(loose)))
     if problem.inertial is None:
         for k in range(0, n, 10):

@@ -81,6 +81,15 @@ class KnownTrees:
 
 
 @dataclass(frozen=True, slots=True)
+class Link:
+    """A relative pose `a_T_b` (4, 4) between keyframes a and b, from a loop just recognised; a guide, no measurement."""
+
+    a: int
+    b: int
+    a_T_b: Array
+
+
+@dataclass(frozen=True, slots=True)
 class Problem:
     """A run, ready for an estimator.
 
@@ -100,6 +109,7 @@ class Problem:
         known: trees that an earlier map knows, or None.
         up: (K, 3) mean axis of the trunks at each keyframe, in its base frame; NaN where there are too few.
         up_sigma: (K,) rad.
+        link: guides a quick solve across a loop; never part of a final one.
     """
 
     stamps_ns: Stamps
@@ -119,6 +129,7 @@ class Problem:
     known: KnownTrees | None = None
     up: Array | None = None
     up_sigma: Array | None = None
+    link: Link | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from topograph.geometry import Array, fit_rigid_2d
+from topograph.geometry import Array, fit_rigid_2d, planar
 from topograph.motion import MotionConfig
 from topograph.trees.tracks import TreesConfig
 
@@ -43,6 +43,8 @@ class LoopCloser:
         tree: (T,) tree of each track; equal numbers are one tree.
         anchored: distance driven when old ground was last recognised, m.
         loops: loops closed so far.
+        link: the last loop: distances driven when the old and the new piece were seen, the centre (2,) about which
+            the new piece turns, and its move (x, y, yaw); see `moved_pose`.
     """
 
     def __init__(self, tracks: int, gyro: bool, config: TreesConfig, motion: MotionConfig) -> None:
@@ -51,6 +53,7 @@ class LoopCloser:
         self.at = 0.0
         self.anchored = 0.0
         self.loops = 0
+        self.link: tuple[float, float, Array, Array] | None = None
 
     def drift(self, d: float) -> tuple[float, float]:
         """Standard deviations of position (m) and heading (rad) after `d` metres of dead reckoning."""
@@ -87,15 +90,28 @@ class LoopCloser:
             sigma, yaw_sigma = cap, min(yaw_sigma, max(0.02, cap / 50.0))
         here, here_id, here_sigma = _centres(t, self.tree, now)
         there, there_id, there_sigma = _centres(t, self.tree, old)
-        result = lay(here, here_sigma, there, there_sigma, sigma, yaw_sigma, c)
+        bend = min(0.5 * self.drift(0.5 * c.recent)[0], 0.3 * cap)  # the piece itself is not quite rigid
+        weight = c.mapped * (1.0 - np.exp(-_hits(t, self.tree, now) / 6.0))
+        result = lay(here, np.hypot(here_sigma, bend), there, there_sigma, sigma, yaw_sigma, c, weight)
         if result is None:
             return False
-        pairs, moved = result
+        pairs, moved, move, centre = result
+        seen_again = np.isin(self.tree, there_id[[j for _, j in pairs]]) & old
+        self.link = (float(np.median(t.last[seen_again])), self.at, centre, move)
         for i, j in pairs:
             self.tree[self.tree == here_id[i]] = there_id[j]
         self.anchored = self.at
         self.loops += 1
         return moved > 0.4
+
+
+def moved_pose(pose: Array, centre: Array, move: Array) -> Array:
+    """A pose (4, 4) turned about `centre` (2,) and shifted by `move` (x, y, yaw) in the plane."""
+    out = planar(0.0, 0.0, move[2]) @ pose
+    c, s = np.cos(move[2]), np.sin(move[2])
+    arm = pose[:2, 3] - centre
+    out[:2, 3] = np.array([c * arm[0] - s * arm[1], s * arm[0] + c * arm[1]]) + centre + move[:2]
+    return np.asarray(out)
 
 
 def _centres(t: TrackTable, tree: NDArray[np.int64], chosen: NDArray[np.bool_]) -> tuple[Array, NDArray[np.int64], Array]:
@@ -107,10 +123,20 @@ def _centres(t: TrackTable, tree: NDArray[np.int64], chosen: NDArray[np.bool_]) 
     return place, ids, np.bincount(index, w * t.sigma[chosen]) / total
 
 
+def _hits(t: TrackTable, tree: NDArray[np.int64], chosen: NDArray[np.bool_]) -> Array:
+    """Sightings (K,) of the trees that the chosen tracks belong to, in the order of `_centres`."""
+    return np.bincount(np.unique(tree[chosen], return_inverse=True)[1], t.hits[chosen]).astype(float)
+
+
 def lay(
-    here: Array, here_sigma: Array, there: Array, there_sigma: Array, sigma: float, yaw_sigma: float, config: TreesConfig
-) -> tuple[list[tuple[int, int]], float] | None:
-    """Pairs (i, j) of recent (N, 2) and old (M, 2) trees that are one, and how far `here` moves (m); None: undecided."""
+    here: Array, here_sigma: Array, there: Array, there_sigma: Array, sigma: float, yaw_sigma: float, config: TreesConfig,
+    mapped: Array,
+) -> tuple[list[tuple[int, int]], float, Array, Array] | None:  # fmt: skip
+    """Pairs (i, j) of recent (N, 2) and old (M, 2) trees that are one, how far `here` moves (m), the move (x, y, yaw) and
+    the centre (2,) that it turns about; None: undecided.
+
+    `mapped` (N,) is the chance of each recent tree to be in the map if this is old ground.
+    """
     centre = here.mean(0)
     arm = float(np.sqrt(np.mean(np.sum((here - centre) ** 2, axis=1)))) + 1.0
     reach = 3.0 * sigma + 3.0 * yaw_sigma * arm + 1.0
@@ -127,7 +153,7 @@ def lay(
     found: list[list[tuple[int, int]]] = []
     for k in range(len(moves)):
         moves[k], scores[k], pairs = _settle(
-            moves[k], here, here_sigma, tree, target_sigma, centre, sigma, yaw_sigma, density, config
+            moves[k], here, here_sigma, tree, target_sigma, centre, sigma, yaw_sigma, density, mapped
         )
         found.append(pairs)
     best = int(np.argmax(scores))
@@ -140,7 +166,7 @@ def lay(
     if scores[best] - rival < config.margin:
         return None
     moved = float(np.abs(_apply(moves[best], here, centre) - here).max())
-    return [(i, int(near[j])) for i, j in found[best]], moved
+    return [(i, int(near[j])) for i, j in found[best]], moved, moves[best], centre
 
 
 def _apply(move: Array, points: Array, centre: Array) -> Array:
@@ -189,7 +215,7 @@ def _seeds(here: Array, there: Array, centre: Array, sigma: float, yaw_sigma: fl
 
 def _settle(
     move: Array, here: Array, here_sigma: Array, tree: cKDTree, there_sigma: Array, centre: Array, sigma: float,
-    yaw_sigma: float, density: float, config: TreesConfig,
+    yaw_sigma: float, density: float, mapped: Array,
 ) -> tuple[Array, float, list[tuple[int, int]]]:  # fmt: skip
     """Refine a move by its own matches and weigh it: log-odds against clutter, and the prior of the drift."""
     pairs: list[tuple[int, int]] = []
@@ -210,13 +236,11 @@ def _settle(
     kept = []
     for i, k in pairs:
         variance = here_sigma[i] ** 2 + there_sigma[k] ** 2 + 0.1**2
-        gain = np.log(config.mapped / (2 * np.pi * variance * density)) - 0.5 * distance[i] ** 2 / variance
-        if gain > np.log(1 - config.mapped):
-            score += gain
+        gain = np.log(mapped[i] / (2 * np.pi * variance * density)) - 0.5 * distance[i] ** 2 / variance
+        if gain > np.log(1 - mapped[i]):
+            score += gain - np.log(1 - mapped[i])
             kept.append((i, k))
-        else:
-            score += np.log(1 - config.mapped)
-    score += (len(here) - len(pairs)) * np.log(1 - config.mapped)
+    score += float(np.log(1 - mapped).sum())
     return move, score, kept
 
 

@@ -11,14 +11,15 @@ from topograph.trees.tracks import TreesConfig
 
 
 def refine(
-    place: Array, sigma: Array, hits: NDArray[np.int64], tree: NDArray[np.int64], config: TreesConfig
+    place: Array, sigma: Array, hits: NDArray[np.int64], tree: NDArray[np.int64], config: TreesConfig, patience: float = 0.0
 ) -> NDArray[np.int64]:
     """Tree (T,) of each track, renumbered from 0, given the tracks' places (T, 2), sigmas and hits in the solved map.
 
-    A track that does not fit its tree leaves it; then trees that lie within each other's gate, or nearer than
+    A track that does not fit its tree leaves it, when it is also farther than `patience` m from it: a map that has
+    just closed its loops is still bent. Then trees that lie within each other's gate, or nearer than
     `config.merge`, become one. Rare tracks join a tree when they fit and are trees of their own otherwise.
     """
-    tree = _leave(place, sigma, hits, tree.copy(), config)
+    tree = _leave(place, sigma, hits, tree.copy(), config, max(patience, config.merge))
     for _ in range(4):
         ids, index = np.unique(tree, return_inverse=True)
         w = hits / np.maximum(sigma, config.floor) ** 2
@@ -43,7 +44,7 @@ def refine(
 
 
 def _leave(
-    place: Array, sigma: Array, hits: NDArray[np.int64], tree: NDArray[np.int64], config: TreesConfig
+    place: Array, sigma: Array, hits: NDArray[np.int64], tree: NDArray[np.int64], config: TreesConfig, patience: float
 ) -> NDArray[np.int64]:
     fresh = int(tree.max(initial=0)) + 1
     order = np.argsort(tree, kind="stable")
@@ -54,7 +55,7 @@ def _leave(
         centre = np.array([_weighted_median(place[group, k], hits[group]) for k in range(2)])
         d = np.linalg.norm(place[group] - centre, axis=1)
         bound = np.sqrt(config.gate * (sigma[group] ** 2 + 2 * config.floor**2))
-        for g in group[d > np.maximum(bound, config.merge)]:
+        for g in group[d > np.maximum(bound, patience)]:
             tree[g] = fresh
             fresh += 1
     return tree

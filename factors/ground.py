@@ -20,4 +20,6 @@ def level(key: int, sigma: float, robot_up: ArrayLike = (0.0, 0.0, 1.0)) -> Any:
     d = np.asarray(robot_up, float)
     if not np.isfinite(d).all() or np.linalg.norm(d) < 1e-6:
         raise ValueError("a direction must be finite and have a length")
-    return gtsam.AttitudeFactorPose3(key, gtsam.Unit3(np.array([0.0, 0.0, 1.0])), sigmas([sigma, sigma]), gtsam.Unit3(d))
+    return gtsam.AttitudeFactorPose3(
+        key, gtsam.Unit3(np.array([0.0, 0.0, 1.0])), sigmas([sigma, sigma]), gtsam.Unit3(d)
+    )

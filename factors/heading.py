@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike
 from factors.noise import Kernel, gaussian, robust
 
 
-def heading(key: int, yaw: float, robot_direction: ArrayLike, sigma: float, kernel: Kernel, *, steepest: float = 0.5) -> Any:
+def heading(
+    key: int, yaw: float, robot_direction: ArrayLike, sigma: float, kernel: Kernel, *, steepest: float = 0.5
+) -> Any:
     """`robot_direction` (3,) points to azimuth `yaw` (rad, from map x) with `sigma`; its elevation is free.
 
     GTSAM compares two directions on the sphere; the part that is elevation gets the deviation `steepest` (rad).

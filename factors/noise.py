@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-_ESTIMATORS = {
+_ESTIMATORS: dict[str, Any] = {
     "huber": gtsam.noiseModel.mEstimator.Huber,
     "cauchy": gtsam.noiseModel.mEstimator.Cauchy,
     "tukey": gtsam.noiseModel.mEstimator.Tukey,
@@ -26,12 +26,12 @@ class Kernel:
 
     def weight(self, distance: ArrayLike) -> NDArray[np.float64]:
         """Weight (...) of residuals whose whitened norm is `distance` (...), as GTSAM's estimators define it."""
-        d = np.asarray(distance, float)
+        d: NDArray[np.float64] = np.asarray(distance, float)
         k = self.width
         if self.name == "none":
             return np.ones_like(d)
         if self.name == "huber":
-            return np.minimum(1.0, k / np.maximum(d, 1e-12))
+            return np.asarray(np.minimum(1.0, k / np.maximum(d, 1e-12)))
         if self.name == "cauchy":
             return np.asarray(k * k / (k * k + d * d))
         if self.name == "tukey":

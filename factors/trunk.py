@@ -83,7 +83,14 @@ def trunk_residual(map_T_robot: Array, map_p_tree: Array, robot_p_trunk: Array) 
 
 
 def trunk_linear(
-    graph: Any, pose_keys: list[int], point_keys: list[int], poses: Array, trees: Array, points: Array, cov: Array, kernel: Kernel
+    graph: Any,
+    pose_keys: list[int],
+    point_keys: list[int],
+    poses: Array,
+    trees: Array,
+    points: Array,
+    cov: Array,
+    kernel: Kernel,
 ) -> Array:
     """Add N sightings, linearised at `poses` (N, 4, 4) and `trees` (N, 3), to a GaussianFactorGraph.
 

@@ -43,7 +43,9 @@ def test_trunk_residual_jacobians(xi: np.ndarray, tree: np.ndarray, z: np.ndarra
     for k in range(6):
         d = np.zeros(6)
         d[k] = h
-        numeric = (factors.trunk_residual(T @ exp(d), tree, z)[0] - factors.trunk_residual(T @ exp(-d), tree, z)[0]) / (2 * h)
+        numeric = (factors.trunk_residual(T @ exp(d), tree, z)[0] - factors.trunk_residual(T @ exp(-d), tree, z)[0]) / (
+            2 * h
+        )
         np.testing.assert_allclose(by_pose[:, k], numeric, atol=1e-5)
     for k in range(3):
         d = np.zeros(3)
@@ -53,7 +55,9 @@ def test_trunk_residual_jacobians(xi: np.ndarray, tree: np.ndarray, z: np.ndarra
 
 
 @given(tangents, points, arrays(float, 3, elements=st.floats(-0.03, 0.03)), st.floats(0.02, 0.3))
-def test_native_trunk_agrees_with_cartesian_twin(xi: np.ndarray, body: np.ndarray, error: np.ndarray, sigma: float) -> None:
+def test_native_trunk_agrees_with_cartesian_twin(
+    xi: np.ndarray, body: np.ndarray, error: np.ndarray, sigma: float
+) -> None:
     """Whitened norms of the native (bearing, range) and of the Cartesian residual agree to first order in error/range."""
     size = np.sort(np.abs(body))
     if np.linalg.norm(body) < 2.0 or size[1] - size[0] < 0.2:  # where two axes are least, Unit3's basis jumps

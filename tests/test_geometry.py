@@ -51,7 +51,7 @@ def test_enu_round_trip(lat: float, lon: float, p: np.ndarray) -> None:
 
 
 def test_enu_axes() -> None:
-    datum = g.Datum(40.0, -8.0, 0.0)
+    datum = g.Datum(*np.array([40.0, -8.0, 0.0]))  # numpy's numbers print differently, and PROJ reads prints
     e, n, u = datum.to_enu([40.0, -8.0 + 1e-4, 10.0])
     assert e == pytest.approx(8.54, abs=0.02)
     assert n == pytest.approx(0, abs=1e-3)

@@ -114,8 +114,12 @@ def main(train_dir: Path, validation_dir: Path) -> None:
     z = score(X)
     one = (y > 0) & (z > 0) & (errors[:, 2] == 1) & (X[:, 2] > np.log(6))
     A = np.stack([X[one, 3], 0.003475 * fits[one, 13], np.ones(one.sum())], 1)
-    print("diameter = a width + b step·range + c:", np.linalg.lstsq(A, fits[one, 6] - errors[one, 3], rcond=None)[0].round(3),
-          "bias", (X[one, 3] - fits[one, 6] + errors[one, 3]).mean().round(4))
+    print(
+        "diameter = a width + b step·range + c:",
+        np.linalg.lstsq(A, fits[one, 6] - errors[one, 3], rcond=None)[0].round(3),
+        "bias",
+        (X[one, 3] - fits[one, 6] + errors[one, 3]).mean().round(4),
+    )
     good = (y > 0) & (z > 0) & (errors[:, 2] == 1)
     cls = np.searchsorted(RANGE_EDGES, fits[:, 13])
     factor = np.ones((2, 4))
@@ -133,8 +137,8 @@ def main(train_dir: Path, validation_dir: Path) -> None:
         "trained_by": "tools/train_score.py",
         "features": list(FEATURES),
         **{k: np.round(v, 5).tolist() for k, v in
-           dict(mean=mean, deviation=deviation, w1=w1, b1=b1, w2=w2, b2=b2,
-                radial_factor=factor[0], tangential_factor=factor[1]).items()},
+           {"mean": mean, "deviation": deviation, "w1": w1, "b1": b1, "w2": w2, "b2": b2,
+            "radial_factor": factor[0], "tangential_factor": factor[1]}.items()},
     }  # fmt: skip
     out.write_text(json.dumps(data) + "\n")
     Xv, yv, _, _ = collect(validation_dir, 4)

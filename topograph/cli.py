@@ -53,14 +53,17 @@ def main(verbose: bool) -> None:
 
 def _input_options(f: _F) -> _F:
     for kind in reversed(_TOPICS):
-        f = click.option(f"--topic-{kind}", default=None, metavar="TOPIC", help=f"Topic of {kind}; 'none' ignores it.")(f)
+        f = click.option(f"--topic-{kind}", default=None, metavar="TOPIC", help=f"Topic of {kind}; 'none' ignores it.")(
+            f
+        )
     f = click.option("--base-frame", default=None, help="Frame whose poses are estimated (base_link).")(f)
     f = click.option(
         "--extrinsic", multiple=True, metavar="FRAME=X,Y,Z,R,P,Y",
         help="Mounting of a sensor in the base frame, metres and radians; repeat for more.",
     )(f)  # fmt: skip
-    f = click.option("--front-end", type=click.Choice(["organised", "thesis"]), default=None, help="How trunks are found.")(f)
-    return click.option("-c", "--config", "config_file", type=click.Path(path_type=Path), help="YAML of `topograph config`.")(f)
+    return click.option(
+        "-c", "--config", "config_file", type=click.Path(path_type=Path), help="YAML of `topograph config`."
+    )(f)
 
 
 def _config(config_file: Path | None, words: dict[str, Any]) -> Any:
@@ -72,8 +75,6 @@ def _config(config_file: Path | None, words: dict[str, Any]) -> Any:
             overrides[f"bags.topic_{kind}"] = words[f"topic_{kind}"]
     if words.get("base_frame"):
         overrides["bags.base_frame"] = words["base_frame"]
-    if words.get("front_end"):
-        overrides["trunks.front_end"] = words["front_end"]
     mounts = {}
     for word in words.get("extrinsic") or ():
         frame, _, numbers = word.partition("=")
@@ -148,7 +149,11 @@ def _hash(path: Path) -> str:
 
 def _versions() -> dict[str, str]:
     names = ("gtsam", "numpy", "scipy", "numba", "rosbags")
-    return {"topograph": __version__, "python": platform.python_version(), **{n: metadata.version(n) for n in names}}
+    return {
+        "topograph": __version__,
+        "python": platform.python_version(),
+        **{n: metadata.version(n) for n in names},
+    }
 
 
 def _peak_mb() -> float:
@@ -237,9 +242,18 @@ def _save_results(
     if true is not None:
         e = solved.estimate
         datum = solved.problem.datum
-        metrics = map_metrics(topo, true) + path_metrics(
-            e.stamps_ns, e.map_T_robot, datum, true.stamps_ns, true.world_T_robot, true.datum if datum is not None else None
-        ) + metrics
+        metrics = (
+            map_metrics(topo, true)
+            + path_metrics(
+                e.stamps_ns,
+                e.map_T_robot,
+                datum,
+                true.stamps_ns,
+                true.world_T_robot,
+                true.datum if datum is not None else None,
+            )
+            + metrics
+        )
         true_trees = true.trees_in(topo.datum) if topo.datum is not None else None
         _, _, error = tree_errors(topo, true)
         if len(error):
@@ -256,7 +270,11 @@ def _save_results(
     write_tum(folder / "path.tum", solved.estimate.stamps_ns, solved.estimate.map_T_robot)
     write_text(folder / "config.yaml", text)
     notes = list(solved.run.notes) + ([pipeline.why_no_trees(solved)] if pipeline.why_no_trees(solved) else [])
-    facts = {"from": ", ".join(p.name for p in bags), "recorded": f"{solved.run.duration_s:.0f} s", "topograph": __version__}
+    facts = {
+        "from": ", ".join(p.name for p in bags),
+        "recorded": f"{solved.run.duration_s:.0f} s",
+        "topograph": __version__,
+    }
     if solved.problem.n_trees:
         store.save(topo, target)
     report.write_json(
@@ -278,7 +296,12 @@ def _save_results(
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 @_input_options
 def compare(
-    bags: tuple[Path, ...], truth: Path | None, results: Path | None, quiet: bool, config_file: Path | None, **words: Any
+    bags: tuple[Path, ...],
+    truth: Path | None,
+    results: Path | None,
+    quiet: bool,
+    config_file: Path | None,
+    **words: Any,
 ) -> None:
     """Map BAGS by factor graph and by the thesis's averaging, side by side on the same detections."""
     from topograph import pipeline, report
@@ -301,7 +324,12 @@ def compare(
         if true is not None:
             datum = topo.datum
             metrics = map_metrics(topo, true) + path_metrics(
-                e.stamps_ns, e.map_T_robot, datum, true.stamps_ns, true.world_T_robot, true.datum if datum is not None else None
+                e.stamps_ns,
+                e.map_T_robot,
+                datum,
+                true.stamps_ns,
+                true.world_T_robot,
+                true.datum if datum is not None else None,
             )
             errors[name] = np.linalg.norm(tree_errors(topo, true)[2][:, :2], axis=1)
         rows[name] = [*metrics, replace(metrics[0], name="seconds", value=e.seconds, unit="s")]
@@ -348,8 +376,18 @@ def inspect(bags: tuple[Path, ...], config_file: Path | None, **words: Any) -> N
 @click.argument("bags", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="One row per trunk and scan.")
 @click.option("--picture", type=click.Path(path_type=Path), help="PNG of a scan with its trunks.")
-@click.option("--at", "at_s", type=float, default=None, help="Seconds into the run of the scan that is drawn (default: the middle).")
-@click.option("--truth", type=click.Path(path_type=Path), help="Folder of simulated truth: precision and recall by range.")
+@click.option(
+    "--at",
+    "at_s",
+    type=float,
+    default=None,
+    help="Seconds into the run of the scan that is drawn (default: the middle).",
+)
+@click.option(
+    "--truth",
+    type=click.Path(path_type=Path),
+    help="Folder of simulated truth: precision and recall by range.",
+)
 @click.option("--results", type=click.Path(path_type=Path), help="Folder for report.json.")
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 @_input_options
@@ -371,8 +409,14 @@ def detect(
         raise InputError("no point cloud and no trunk detections; name a topic with --topic-points or --topic-trunks")
     trunks = sorted(run.trunks, key=lambda t: t.stamp_ns)
     n = sum(map(len, trunks))
-    click.echo(f"{run.scans} scans, {n} trunks ({n / run.scans:.1f} a scan), {run.seconds:.1f} s, {run.duration_s / run.seconds:.1f} × real time")
-    metrics = [Metric("scans", run.scans), Metric("trunks", n), Metric("real-time factor", run.duration_s / run.seconds, "", "higher")]
+    click.echo(
+        f"{run.scans} scans, {n} trunks ({n / run.scans:.1f} a scan), {run.seconds:.1f} s, {run.duration_s / run.seconds:.1f} × real time"
+    )
+    metrics = [
+        Metric("scans", run.scans),
+        Metric("trunks", n),
+        Metric("real-time factor", run.duration_s / run.seconds, "", "higher"),
+    ]
     reach = np.concatenate([np.hypot(t.p[:, 0], t.p[:, 1]) for t in trunks])
     if true is None:
         for low, high in ((0, 5), (5, 10), (10, 20), (20, 30)):
@@ -402,12 +446,22 @@ def detect(
         if true is not None:
             from topograph.geometry import interpolate
 
-            feet = transform(inverse(interpolate(true.stamps_ns, true.world_T_robot, [scan.stamp_ns])[0]), true.trees)[:, :2]
+            feet = transform(inverse(interpolate(true.stamps_ns, true.world_T_robot, [scan.stamp_ns])[0]), true.trees)[
+                :, :2
+            ]
         picture.write_bytes(report.scan_figure(scan, mount, shown, feet))
     if results is not None:
         results.mkdir(parents=True, exist_ok=True)
         inputs = [{"path": p.name, "sha256": _hash(p)} for p in bags]
-        report.write_json(results / "report.json", metrics, run.skipped, inputs, {"read": run.seconds}, _peak_mb(), notes=run.notes)
+        report.write_json(
+            results / "report.json",
+            metrics,
+            run.skipped,
+            inputs,
+            {"read": run.seconds},
+            _peak_mb(),
+            notes=run.notes,
+        )
 
 
 @main.command()
@@ -436,7 +490,9 @@ def simulate(
         raise UsageError(f"--design {design}: known are {', '.join(DESIGNS)}")
     if (compression == "lz4" and output.suffix != ".bag") or (compression == "zstd" and output.suffix == ".bag"):
         raise UsageError(f"--compression {compression}: lz4 is for .bag, zstd for mcap")
-    sensor = SensorConfig(gnss=gnss, rings=int(rings), sweep_hz=sweep_hz, detections=detections, compression=compression)
+    sensor = SensorConfig(
+        gnss=gnss, rings=int(rings), sweep_hz=sweep_hz, detections=detections, compression=compression
+    )
     drive = DriveConfig(run=number, stop_every=stop_every, longest_s=longest, laps=laps)
     with _progress(quiet) as progress:
         truth = record(output, seed, design, drive, sensor, progress=lambda share: progress("simulate", share))
@@ -503,7 +559,13 @@ def view(map_file: Path, output: Path) -> None:
 
 
 @main.command("config")
-@click.option("-c", "--config", "config_file", type=click.Path(path_type=Path), help="Check this file and fill in the rest.")
+@click.option(
+    "-c",
+    "--config",
+    "config_file",
+    type=click.Path(path_type=Path),
+    help="Check this file and fill in the rest.",
+)
 def config_command(config_file: Path | None) -> None:
     """Print the whole configuration as YAML."""
     from topograph.config import dump, load

@@ -196,5 +196,6 @@ def _topocentric(datum: Datum) -> Any:
     return Transformer.from_pipeline(
         "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad "
         "+step +proj=cart +ellps=WGS84 "
-        f"+step +proj=topocentric +ellps=WGS84 +lat_0={datum.lat!r} +lon_0={datum.lon!r} +h_0={datum.h!r}"
+        f"+step +proj=topocentric +ellps=WGS84 "
+        f"+lat_0={float(datum.lat)!r} +lon_0={float(datum.lon)!r} +h_0={float(datum.h)!r}"
     )

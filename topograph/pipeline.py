@@ -131,7 +131,9 @@ def read_run(paths: Sequence[Path], config: Config, progress: Progress = _silent
         trunks += [detect(s, builder) for s in pending]
         progress("read", 1.0)
         streams = builder.build(recording.skipped)
-        mounts = {k: recording.frames.find(streams.frames[k]) for k in ("imu", "fix", "heading") if k in streams.frames}
+        mounts: dict[str, Array | None] = {
+            k: recording.frames.find(streams.frames[k]) for k in ("imu", "fix", "heading") if k in streams.frames
+        }
         child = streams.frames.get("child", "")
         base_T_child = recording.frames.find(child)
         if base_T_child is None:
@@ -146,7 +148,16 @@ def read_run(paths: Sequence[Path], config: Config, progress: Progress = _silent
         skipped = recording.skipped
         chosen, duration = dict(recording.chosen), recording.duration_s
     return Run(
-        streams, trunks, mounts, inverse(base_T_child), chosen, skipped, notes, scans, time.perf_counter() - began, duration
+        streams,
+        trunks,
+        mounts,
+        inverse(base_T_child),
+        chosen,
+        skipped,
+        notes,
+        scans,
+        time.perf_counter() - began,
+        duration,
     )
 
 
@@ -174,7 +185,12 @@ def _detector(recording: Recording, config: TrunksConfig) -> Callable[[Scan, Str
 
 
 def solve_run(
-    run: Run, config: Config, *, check_fixes: int = 0, known: TopoMap | None = None, progress: Progress = _silent
+    run: Run,
+    config: Config,
+    *,
+    check_fixes: int = 0,
+    known: TopoMap | None = None,
+    progress: Progress = _silent,
 ) -> Solved:
     """Associate and solve. Every `check_fixes`-th fix is withheld from the estimator and kept for checking.
 
@@ -223,7 +239,18 @@ def solve_run(
     tree, problem, estimate, score, hits, rejected, loops = _associate_and_solve(problem, config, progress)
     seconds["associate and solve"] = time.perf_counter() - began
     return Solved(
-        run, motion, detections, problem, estimate, tree, score, hits, np.flatnonzero(~used), rejected, loops, seconds
+        run,
+        motion,
+        detections,
+        problem,
+        estimate,
+        tree,
+        score,
+        hits,
+        np.flatnonzero(~used),
+        rejected,
+        loops,
+        seconds,
     )
 
 
@@ -290,7 +317,12 @@ class _Association:
     def solve(self, e: Estimate, *, least: int = 3, patient: bool = False, link: Link | None = None) -> Estimate:
         """An estimate without covariances of the trees as they are now; `patient`: until it has converged."""
         if link is not None:  # pull the loop shut with the trees as they were, then join them
-            e = graph.solve(replace(self.problem, start=e.map_T_robot, link=link), self.config.estimate, quick=True, patient=True)
+            e = graph.solve(
+                replace(self.problem, start=e.map_T_robot, link=link),
+                self.config.estimate,
+                quick=True,
+                patient=True,
+            )
         self.problem, _, _ = self.with_trees(self.tree_of_track, least)
         self.problem = replace(self.problem, start=e.map_T_robot)
         return graph.solve(self.problem, self.config.estimate, quick=True, patient=patient)
@@ -323,7 +355,15 @@ def _associate_and_solve(
     if not len(d):
         problem = replace(problem, start=estimate.map_T_robot)
         none = np.zeros(0, np.int64)
-        return none, problem, replace(graph.solve(problem, config.estimate), tree=none), np.zeros(0), none, 0, 0
+        return (
+            none,
+            problem,
+            replace(graph.solve(problem, config.estimate), tree=none),
+            np.zeros(0),
+            none,
+            0,
+            0,
+        )
     a = _Association(problem, config)
     end = float(problem.motion.distance[-1])
     cap = _gnss_cap(problem, a.closer)
@@ -357,7 +397,15 @@ def _associate_and_solve(
     estimate = graph.solve(problem, config.estimate)
     progress("solve", 1.0)
     place = np.searchsorted(ids, final)
-    return tree, problem, replace(estimate, tree=tree), score[place], hits[place], int((~ok).sum()), a.closer.loops
+    return (
+        tree,
+        problem,
+        replace(estimate, tree=tree),
+        score[place],
+        hits[place],
+        int((~ok).sum()),
+        a.closer.loops,
+    )
 
 
 def _link(problem: Problem, estimate: Estimate, closer: LoopCloser) -> Link | None:
@@ -404,7 +452,14 @@ def topo_map(solved: Solved, config: Config, meta: dict[str, str]) -> TopoMap:
     ordered = sorted(solved.run.trunks, key=lambda t: t.stamp_ns)
     unique = [t for i, t in enumerate(ordered) if i == 0 or t.stamp_ns > ordered[i - 1].stamp_ns]
     return build(
-        solved.estimate, solved.detections, unique, map_T_scans(solved), solved.score, solved.problem.datum, config.topomap, meta
+        solved.estimate,
+        solved.detections,
+        unique,
+        map_T_scans(solved),
+        solved.score,
+        solved.problem.datum,
+        config.topomap,
+        meta,
     )
 
 
@@ -421,7 +476,14 @@ def baseline(solved: Solved, config: Config) -> tuple[Estimate, TopoMap]:
     e = replace(e, trees=e.trees[keep], tree_cov=e.tree_cov[keep], tree=tree)
     poses = path_at(e.stamps_ns, e.map_T_robot, solved.motion, solved.detections.stamps_ns)
     topo = build(
-        e, solved.detections, [], poses, np.zeros(int(keep.sum())), solved.problem.datum, config.topomap, {"method": "thesis"}
+        e,
+        solved.detections,
+        [],
+        poses,
+        np.zeros(int(keep.sum())),
+        solved.problem.datum,
+        config.topomap,
+        {"method": "thesis"},
     )
     return e, topo
 
@@ -457,7 +519,9 @@ def extend(old: TopoMap, new: TopoMap, solved: Solved, config: Config) -> TopoMa
     return merge(old, new, known.tree, config.topomap)
 
 
-def scan_near(paths: Sequence[Path], config: Config, stamp_ns: int, trunks: Sequence[Trunks]) -> tuple[Scan, Array, Trunks]:
+def scan_near(
+    paths: Sequence[Path], config: Config, stamp_ns: int, trunks: Sequence[Trunks]
+) -> tuple[Scan, Array, Trunks]:
     """The scan nearest to a stamp, the LiDAR's mounting, and the trunks found in it."""
     with Recording(paths, config.bags) as recording:
         best: Scan | None = None

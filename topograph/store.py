@@ -97,7 +97,10 @@ def _fill(c: sqlite3.Connection, t: TopoMap) -> None:
         )
         c.execute("INSERT INTO gpkg_geometry_columns VALUES (?,?,?,?,?,?)", (name, "geom", kind, srs, 1, 0))
     for name in ("viewpoints", "meta"):
-        c.execute("INSERT INTO gpkg_contents (table_name, data_type, identifier) VALUES (?,?,?)", (name, "attributes", name))
+        c.execute(
+            "INSERT INTO gpkg_contents (table_name, data_type, identifier) VALUES (?,?,?)",
+            (name, "attributes", name),
+        )
     c.executemany(
         "INSERT INTO trees VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)",
         [
@@ -120,7 +123,13 @@ def _fill(c: sqlite3.Connection, t: TopoMap) -> None:
     c.executemany(
         "INSERT INTO path VALUES (?,?,?,?,?,?,?,?,?,?)",
         [
-            (k + 1, int(t.stamps_ns[k]), *_real(track[k]), *_real(q[k]), _geometry(world_track[k : k + 1], srs))
+            (
+                k + 1,
+                int(t.stamps_ns[k]),
+                *_real(track[k]),
+                *_real(q[k]),
+                _geometry(world_track[k : k + 1], srs),
+            )
             for k in range(len(track))
         ],
     )
@@ -232,4 +241,8 @@ def _viewpoint(path: Path, place: dict[int, int], r: tuple[int, float, float, fl
     tree, vx, vy, vz, points, blob, crc = r
     if zlib.crc32(blob) != crc or len(blob) != 6 * points:
         raise MapError(f"{path}: the cloud of tree {tree} is damaged; map the bags again or restore a copy")
-    return Viewpoint(place[tree], np.array([vx, vy, vz]), np.frombuffer(blob, "<i2").reshape(-1, 3).astype(np.float32) / 1000)
+    return Viewpoint(
+        place[tree],
+        np.array([vx, vy, vz]),
+        (np.frombuffer(blob, "<i2").reshape(-1, 3) * 0.001).astype(np.float32),
+    )

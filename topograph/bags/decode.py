@@ -125,15 +125,23 @@ def _log_odds(result: Any) -> float:
 def _clusters(m: Any) -> Trunks:
     n = len(m.clusters)
     p = np.array([[c.centroid.x, c.centroid.y, c.centroid.z] for c in m.clusters], float).reshape(n, 3)
-    clouds = tuple(decode_scan(c.cloud, 0).xyz if len(c.cloud.fields) else np.zeros((0, 3), np.float32) for c in m.clusters)
+    clouds = tuple(
+        decode_scan(c.cloud, 0).xyz if len(c.cloud.fields) else np.zeros((0, 3), np.float32) for c in m.clusters
+    )
     axis = np.tile([0.0, 0.0, 1.0], (n, 1))
     return _trunks(m, p, axis, np.full(n, np.nan), np.zeros(n), clouds, surface=True)
 
 
 def _trunks(
-    m: Any, p: Array, axis: Array, diameter: Array, score: Array, clouds: tuple[Any, ...] = (), surface: bool = False
+    m: Any,
+    p: Array,
+    axis: Array,
+    diameter: Array,
+    score: Array,
+    clouds: tuple[Any, ...] = (),
+    surface: bool = False,
 ) -> Trunks:
-    keep = np.isfinite(p).all(axis=1) & np.isfinite(axis).all(axis=1)
+    keep = np.asarray(np.isfinite(p).all(axis=1) & np.isfinite(axis).all(axis=1))
     n = int(keep.sum())
     return Trunks(
         stamp_of(m.header),

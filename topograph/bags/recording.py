@@ -80,7 +80,9 @@ class Recording:
                 starts.append(reader.start_time)
                 ends.append(reader.end_time)
         if not starts:
-            raise InputError(f"{', '.join(map(str, self.paths))}: no messages; record again or check `topograph inspect`")
+            raise InputError(
+                f"{', '.join(map(str, self.paths))}: no messages; record again or check `topograph inspect`"
+            )
         self.start_ns = min(starts)
         self.duration_s = (max(ends) - self.start_ns) * 1e-9
         self.chosen = topics.choose({t: k for t, k in self.types.items() if self.counts[t]}, self.config)
@@ -89,7 +91,9 @@ class Recording:
     def _read_tf(self) -> None:
         for name, most in (("tf", 500), ("tf_static", 10_000)):  # static last: it wins
             for reader in self._readers:
-                found = [c for c in reader.connections if c.topic.endswith(name) and c.msgtype == "tf2_msgs/msg/TFMessage"]
+                found = [
+                    c for c in reader.connections if c.topic.endswith(name) and c.msgtype == "tf2_msgs/msg/TFMessage"
+                ]
                 if not found:
                     continue
                 for n, (c, _, raw) in enumerate(reader.messages(connections=found)):
@@ -190,6 +194,15 @@ def _open(path: Path) -> AnyReader:
     try:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
-    except (AnyReaderError, OSError, ValueError, EOFError, struct.error, RuntimeError, AssertionError, KeyError) as err:
+    except (
+        AnyReaderError,
+        OSError,
+        ValueError,
+        EOFError,
+        struct.error,
+        RuntimeError,
+        AssertionError,
+        KeyError,
+    ) as err:
         raise InputError(f"{path}: {why_unreadable(path, err)}") from err
     return reader

@@ -89,7 +89,7 @@ def _offsets(view: NDArray[Any], names: dict[str, str], stamp_ns: int) -> NDArra
         return None
     if "time_sec" in names and "time_nsec" in names:
         ns = view[names["time_sec"]].astype(np.int64) * 1_000_000_000 + view[names["time_nsec"]].astype(np.int64)
-        t: NDArray[np.float64] = (ns - (stamp_ns if ns.max() > 10**15 else 0)) * 1e-9
+        t: NDArray[Any] = (ns - (stamp_ns if ns.max() > 10**15 else 0)) * 1e-9
     else:
         name = next((names[n] for n in _TIME_NAMES if n in names), None)
         if name is None or view[name].ndim > 1:

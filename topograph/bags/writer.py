@@ -86,7 +86,9 @@ class BagWriter:
 
     def _header(self, stamp_ns: int, frame: str) -> Any:
         stamp = self._msg(
-            "builtin_interfaces/msg/Time", sec=int(stamp_ns // 1_000_000_000), nanosec=int(stamp_ns % 1_000_000_000)
+            "builtin_interfaces/msg/Time",
+            sec=int(stamp_ns // 1_000_000_000),
+            nanosec=int(stamp_ns % 1_000_000_000),
         )
         self._seq += 1
         extra = {"seq": self._seq} if self._ros1 else {}
@@ -108,7 +110,11 @@ class BagWriter:
         return self._msg("geometry_msgs/msg/Quaternion", x=float(q[0]), y=float(q[1]), z=float(q[2]), w=float(q[3]))
 
     def _pose(self, T: Array) -> Any:
-        return self._msg("geometry_msgs/msg/Pose", position=self._point(T[:3, 3]), orientation=self._quaternion(to_quaternion(T)))
+        return self._msg(
+            "geometry_msgs/msg/Pose",
+            position=self._point(T[:3, 3]),
+            orientation=self._quaternion(to_quaternion(T)),
+        )
 
     def tf_static(self, log_ns: int, transforms: dict[tuple[str, str], Array], topic: str = "/tf_static") -> None:
         """Mounts: (parent, child) -> parent_T_child (4, 4)."""
@@ -118,7 +124,9 @@ class BagWriter:
                 header=self._header(log_ns, parent),
                 child_frame_id=child,
                 transform=self._msg(
-                    "geometry_msgs/msg/Transform", translation=self._vector(T[:3, 3]), rotation=self._quaternion(to_quaternion(T))
+                    "geometry_msgs/msg/Transform",
+                    translation=self._vector(T[:3, 3]),
+                    rotation=self._quaternion(to_quaternion(T)),
                 ),
             )
             for (parent, child), T in transforms.items()
@@ -135,7 +143,13 @@ class BagWriter:
         for name in view.dtype.names or ():
             sub, offset = view.dtype.fields[name][:2]  # type: ignore[index]  # a structured dtype has fields
             fields.append(
-                self._msg("sensor_msgs/msg/PointField", name=name, offset=int(offset), datatype=kinds[sub.str[1:]], count=1)
+                self._msg(
+                    "sensor_msgs/msg/PointField",
+                    name=name,
+                    offset=int(offset),
+                    datatype=kinds[sub.str[1:]],
+                    count=1,
+                )
             )
         width = len(view) // height
         data = np.frombuffer(view.tobytes(), np.uint8)
@@ -179,7 +193,9 @@ class BagWriter:
         )  # fmt: skip
         self._write(topic, "nav_msgs/msg/Odometry", log_ns, message)
 
-    def fix(self, topic: str, log_ns: int, stamp_ns: int, frame: str, lat_lon_h: Array, cov: Array, status: int) -> None:
+    def fix(
+        self, topic: str, log_ns: int, stamp_ns: int, frame: str, lat_lon_h: Array, cov: Array, status: int
+    ) -> None:
         """A NavSatFix: degrees, degrees, m; ENU covariance (3, 3) in m²."""
         message = self._msg(
             "sensor_msgs/msg/NavSatFix", header=self._header(stamp_ns, frame),
@@ -192,7 +208,9 @@ class BagWriter:
     def heading(self, topic: str, log_ns: int, stamp_ns: int, frame: str, quaternion: Array) -> None:
         """A heading as QuaternionStamped."""
         message = self._msg(
-            "geometry_msgs/msg/QuaternionStamped", header=self._header(stamp_ns, frame), quaternion=self._quaternion(quaternion)
+            "geometry_msgs/msg/QuaternionStamped",
+            header=self._header(stamp_ns, frame),
+            quaternion=self._quaternion(quaternion),
         )
         self._write(topic, "geometry_msgs/msg/QuaternionStamped", log_ns, message)
 
@@ -202,12 +220,26 @@ class BagWriter:
         """Trunk detections as Detection3DArray: p (N, 3), diameter (N,), quaternion (N, 4) whose z is the axis."""
         detections = []
         for i in range(len(p)):
-            T = self._msg("geometry_msgs/msg/Pose", position=self._point(p[i]), orientation=self._quaternion(quaternion[i]))
-            box = self._msg("vision_msgs/msg/BoundingBox3D", center=T, size=self._vector((diameter[i], diameter[i], 0.0)))
-            detections.append(
-                self._msg("vision_msgs/msg/Detection3D", header=self._header(stamp_ns, frame), results=[], bbox=box, id="")
+            T = self._msg(
+                "geometry_msgs/msg/Pose",
+                position=self._point(p[i]),
+                orientation=self._quaternion(quaternion[i]),
             )
-        message = self._msg("vision_msgs/msg/Detection3DArray", header=self._header(stamp_ns, frame), detections=detections)
+            box = self._msg(
+                "vision_msgs/msg/BoundingBox3D", center=T, size=self._vector((diameter[i], diameter[i], 0.0))
+            )
+            detections.append(
+                self._msg(
+                    "vision_msgs/msg/Detection3D",
+                    header=self._header(stamp_ns, frame),
+                    results=[],
+                    bbox=box,
+                    id="",
+                )
+            )
+        message = self._msg(
+            "vision_msgs/msg/Detection3DArray", header=self._header(stamp_ns, frame), detections=detections
+        )
         self._write(topic, "vision_msgs/msg/Detection3DArray", log_ns, message)
 
     def clusters(self, topic: str, log_ns: int, stamp_ns: int, frame: str, clouds: list[NDArray[np.float32]]) -> None:
@@ -218,7 +250,8 @@ class BagWriter:
             for k, a in enumerate("xyz"):
                 view[a] = cloud[:, k]
             fields = [
-                self._msg("sensor_msgs/msg/PointField", name=a, offset=4 * k, datatype=7, count=1) for k, a in enumerate("xyz")
+                self._msg("sensor_msgs/msg/PointField", name=a, offset=4 * k, datatype=7, count=1)
+                for k, a in enumerate("xyz")
             ]
             message = self._msg(
                 "sensor_msgs/msg/PointCloud2", header=self._header(stamp_ns, frame), height=1, width=len(cloud), fields=fields,
@@ -226,7 +259,12 @@ class BagWriter:
                 data=np.frombuffer(view.tobytes(), np.uint8), is_dense=True,
             )  # fmt: skip
             found.append(
-                self._msg("pcl_processing/msg/Cluster", num_points=len(cloud), centroid=self._point(cloud.mean(0)), cloud=message)
+                self._msg(
+                    "pcl_processing/msg/Cluster",
+                    num_points=len(cloud),
+                    centroid=self._point(cloud.mean(0)),
+                    cloud=message,
+                )
             )
         array = self._msg("pcl_processing/msg/ClusterArray", header=self._header(stamp_ns, frame), clusters=found)
         self._write(topic, "pcl_processing/msg/ClusterArray", log_ns, array)

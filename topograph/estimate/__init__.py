@@ -4,7 +4,7 @@
 know of each other.
 """
 
-from topograph.estimate.problem import Estimate, EstimateConfig, Fixes, Headings, KnownTrees, Link, Problem
 from topograph.estimate.path import path_at
+from topograph.estimate.problem import Estimate, EstimateConfig, Fixes, Headings, KnownTrees, Link, Problem
 
 __all__ = ["Estimate", "EstimateConfig", "Fixes", "Headings", "KnownTrees", "Link", "Problem", "path_at"]

@@ -113,7 +113,12 @@ def _fixes(
 
 
 def _headings(
-    keyframes_ns: Stamps, odom: Array, motion: Motion, streams: Streams, robot_T_baseline: Array, datum: Datum | None
+    keyframes_ns: Stamps,
+    odom: Array,
+    motion: Motion,
+    streams: Streams,
+    robot_T_baseline: Array,
+    datum: Datum | None,
 ) -> Headings:
     stamps = streams.heading_ns
     inside = (stamps >= keyframes_ns[0]) & (stamps <= keyframes_ns[-1])

@@ -18,8 +18,8 @@ import factors
 from factors import Kernel
 from topograph.errors import InsufficientDataError
 from topograph.estimate import covariance
-from topograph.estimate.initial import initial_path, yaw_of_direction
 from topograph.estimate.inertia import Inertia, inertia
+from topograph.estimate.initial import initial_path, yaw_of_direction
 from topograph.estimate.problem import Estimate, EstimateConfig, Problem
 from topograph.estimate.solver import levenberg_marquardt, with_big_stack
 from topograph.geometry import Array, inverse, log, transform, wrap
@@ -128,9 +128,17 @@ def _graph(problem: Problem, p: _Pass, config: EstimateConfig, inert: Inertia | 
         sigma = [0.1, 0.1, 0.02, 0.2, 0.2, 0.5]
         g.add(factors.odometry(X + problem.link.a, X + problem.link.b, _orthonormal(problem.link.a_T_b), sigma))
     for k, direction, yaw, sigma in zip(
-        problem.headings.keyframe.tolist(), problem.headings.direction, problem.headings.yaw, problem.headings.sigma, strict=True
+        problem.headings.keyframe.tolist(),
+        problem.headings.direction,
+        problem.headings.yaw,
+        problem.headings.sigma,
+        strict=True,
     ):
-        g.add(factors.heading(X + k, float(yaw), direction, max(float(sigma), config.heading_floor), Kernel("huber", 1.345)))
+        g.add(
+            factors.heading(
+                X + k, float(yaw), direction, max(float(sigma), config.heading_floor), Kernel("huber", 1.345)
+            )
+        )
     if trunks:
         s = problem.sightings
         cov = p.trunk_scale**2 * s.cov
@@ -159,7 +167,11 @@ def _add_motion(g: Any, problem: Problem, inert: Inertia | None) -> None:
     if problem.pose_sigma is not None:
         assert problem.start is not None
         for k in range(n):
-            g.add(gtsam.PriorFactorPose3(X + k, factors.to_pose3(problem.start[k]), factors.sigmas([problem.pose_sigma] * 6)))
+            g.add(
+                gtsam.PriorFactorPose3(
+                    X + k, factors.to_pose3(problem.start[k]), factors.sigmas([problem.pose_sigma] * 6)
+                )
+            )
         return
     step = inverse(problem.odom_T_robot[:-1]) @ problem.odom_T_robot[1:]
     sigma = problem.step_sigma.copy()

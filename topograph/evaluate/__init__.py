@@ -3,4 +3,13 @@
 from topograph.evaluate.metrics import Metric, fix_metrics, map_metrics, path_metrics, trunk_metrics
 from topograph.evaluate.truth import Truth, read_tum, write_tum
 
-__all__ = ["Metric", "Truth", "fix_metrics", "map_metrics", "path_metrics", "read_tum", "trunk_metrics", "write_tum"]
+__all__ = [
+    "Metric",
+    "Truth",
+    "fix_metrics",
+    "map_metrics",
+    "path_metrics",
+    "read_tum",
+    "trunk_metrics",
+    "write_tum",
+]

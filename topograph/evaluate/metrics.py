@@ -97,7 +97,12 @@ def doubles(topo: TopoMap, nearer: float = 1.0) -> Metric:
 
 
 def path_metrics(
-    stamps_ns: Stamps, poses: Array, datum: Datum | None, true_ns: Stamps, true_poses: Array, true_datum: Datum | None
+    stamps_ns: Stamps,
+    poses: Array,
+    datum: Datum | None,
+    true_ns: Stamps,
+    true_poses: Array,
+    true_datum: Datum | None,
 ) -> list[Metric]:
     """Error of a path. With both datums known it is compared as it is; else after the best rigid motion (ATE)."""
     inside = (stamps_ns >= true_ns[0] - 10_000_000) & (stamps_ns <= true_ns[-1] + 10_000_000)
@@ -144,7 +149,12 @@ def fix_metrics(antenna: Array, fix: Array, sigma: Array) -> list[Metric]:
 
 
 def trunk_metrics(
-    truth: Truth, stamps_ns: Stamps, p: list[Array], *, edges: tuple[float, ...] = (0.0, 10.0, 20.0, 30.0), gate: float = 0.5
+    truth: Truth,
+    stamps_ns: Stamps,
+    p: list[Array],
+    *,
+    edges: tuple[float, ...] = (0.0, 10.0, 20.0, 30.0),
+    gate: float = 0.5,
 ) -> tuple[list[Metric], list[dict[str, float]]]:
     """Precision and recall per sweep and by range (the thesis's Table 5.1, with recall).
 

@@ -78,7 +78,9 @@ class Truth:
                 with np.load(folder / "returns.npz", allow_pickle=False) as z:
                     scans, returns = z["stamps_ns"], z["returns"]
         except (OSError, ValueError, KeyError) as err:
-            raise InputError(f"{folder}: not a truth folder ({err}); give the <name>.truth folder beside the bag") from err
+            raise InputError(
+                f"{folder}: not a truth folder ({err}); give the <name>.truth folder beside the bag"
+            ) from err
 
         def column(*names: str) -> Array:
             return np.array([[float(r[n]) for n in names] for r in rows]).reshape(len(rows), len(names))

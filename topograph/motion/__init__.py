@@ -5,4 +5,13 @@ from topograph.motion.reckon import Motion, MotionConfig, dead_reckon
 from topograph.motion.streams import Streams, StreamsBuilder
 from topograph.motion.twist import twist_during
 
-__all__ = ["Inertial", "Motion", "MotionConfig", "Streams", "StreamsBuilder", "align_imu", "dead_reckon", "twist_during"]
+__all__ = [
+    "Inertial",
+    "Motion",
+    "MotionConfig",
+    "Streams",
+    "StreamsBuilder",
+    "align_imu",
+    "dead_reckon",
+    "twist_during",
+]

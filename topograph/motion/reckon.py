@@ -85,7 +85,9 @@ class Motion:
         return np.stack([tilt, tilt, yaw, along, across, up], axis=1)
 
 
-def dead_reckon(streams: Streams, inertial: Inertial | None, child_T_robot: Array, config: MotionConfig) -> Motion | None:
+def dead_reckon(
+    streams: Streams, inertial: Inertial | None, child_T_robot: Array, config: MotionConfig
+) -> Motion | None:
     """Motion of the base from what there is: wheels and IMU, wheels alone, IMU alone; None with neither.
 
     With the IMU alone the turn is known and the distance is not: the poses stay in place.
@@ -168,7 +170,7 @@ def _quaternion_of(roll: float, pitch: float) -> Array:
 
 
 @njit(cache=True)
-def _filter(q0, rate, force, dt, tau, gravity):  # type: ignore[no-untyped-def]
+def _filter(q0, rate, force, dt, tau, gravity):
     n = len(rate)
     out = np.empty((n, 4))
     x, y, z, w = q0

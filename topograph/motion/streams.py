@@ -114,9 +114,12 @@ def _usable(f: Fix, skipped: Counter[str]) -> bool:
         skipped["fix: position not finite"] += 1
     elif abs(lat) < 1e-9 and abs(lon) < 1e-9:
         skipped["fix: position is 0, 0"] += 1
-    elif not np.isfinite(variance).all() or (variance < 0).any() or variance[:2].max() > 1e4:
-        skipped["fix: absurd covariance"] += 1
-    elif np.abs(f.cov - np.diag(variance)).max() > 0.999 * variance.max() and variance.max() > 0:
+    elif (
+        not np.isfinite(variance).all()
+        or (variance < 0).any()
+        or variance[:2].max() > 1e4
+        or (np.abs(f.cov - np.diag(variance)).max() > 0.999 * variance.max() and variance.max() > 0)
+    ):
         skipped["fix: absurd covariance"] += 1
     else:
         return True

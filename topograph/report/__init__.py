@@ -1,6 +1,12 @@
 """Tables, figures, HTML, exports. Computes no number that is not already a metric."""
 
-from topograph.report.figures import comparison_figure, map_figure, residual_figure, scan_figure, tree_error_figure
+from topograph.report.figures import (
+    comparison_figure,
+    map_figure,
+    residual_figure,
+    scan_figure,
+    tree_error_figure,
+)
 from topograph.report.page import write_page
 from topograph.report.record import write_json
 

@@ -48,10 +48,28 @@ def map_figure(topo: TopoMap, true_trees: Array | None = None, title: str = "") 
             values, vectors = np.linalg.eigh(topo.cov[i, :2, :2])
             size = 2 * 10 * np.sqrt(5.991 * np.maximum(values, 0))
             angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
-            ax.add_patch(Ellipse(tuple(topo.p[i, :2]), size[1], size[0], angle=angle, fill=False, color=TREE, lw=0.6, alpha=0.7))
+            ax.add_patch(
+                Ellipse(
+                    tuple(topo.p[i, :2]),
+                    size[1],
+                    size[0],
+                    angle=angle,
+                    fill=False,
+                    color=TREE,
+                    lw=0.6,
+                    alpha=0.7,
+                )
+            )
     if len(topo) <= 80:
         for i in range(len(topo)):
-            ax.annotate(str(topo.ids[i]), topo.p[i, :2], xytext=(4, 4), textcoords="offset points", fontsize=7, color="#444444")
+            ax.annotate(
+                str(topo.ids[i]),
+                topo.p[i, :2],
+                xytext=(4, 4),
+                textcoords="offset points",
+                fontsize=7,
+                color="#444444",
+            )
     ax.plot([], [], "o", color=TREE, label="tree (95 % ellipse ×10)")
     ax.set_aspect("equal")
     frame = "east, north of the datum" if topo.datum is not None else "local frame, not georeferenced"
@@ -113,7 +131,15 @@ def scan_figure(scan: Scan, base_T_lidar: Array, trunks: Trunks, true: Array | N
     dots = ax.scatter(p[near, 0], p[near, 1], s=0.8, c=np.clip(p[near, 2], -1, 3), cmap="viridis", linewidths=0)
     figure.colorbar(dots, ax=ax, shrink=0.7, label="z in base_link [m]")
     for i in range(len(trunks)):
-        ax.add_patch(Circle(tuple(trunks.p[i, :2]), max(0.5 * float(trunks.diameter[i]), 0.1), color=BAD, fill=False, lw=1.2))
+        ax.add_patch(
+            Circle(
+                tuple(trunks.p[i, :2]),
+                max(0.5 * float(trunks.diameter[i]), 0.1),
+                color=BAD,
+                fill=False,
+                lw=1.2,
+            )
+        )
         ax.add_patch(Circle(tuple(trunks.p[i, :2]), 0.6, color=BAD, fill=False, lw=0.6))
         ax.annotate(f"{trunks.score[i]:.1f}", trunks.p[i, :2], xytext=(6, 6), textcoords="offset points", fontsize=7)
     if true is not None:

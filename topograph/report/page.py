@@ -72,7 +72,10 @@ def write_page(
     cards = "".join(
         f'<div class="card"><b>{html.escape(show(m))}</b><span>{html.escape(m.name)}</span></div>' for m in metrics
     )
-    parts = [f"<h1>{html.escape(title)}</h1>", f'<p class="sub">{html.escape(" · ".join(f"{k} {v}" for k, v in facts.items()))}</p>']
+    parts = [
+        f"<h1>{html.escape(title)}</h1>",
+        f'<p class="sub">{html.escape(" · ".join(f"{k} {v}" for k, v in facts.items()))}</p>',
+    ]
     parts += [f'<p class="note">{html.escape(n)}</p>' for n in notes]
     parts.append(f'<div class="cards">{cards}</div>')
     script = ""
@@ -87,7 +90,9 @@ def write_page(
         script = f'<script type="application/json" id="data">{data}</script><script>{_SCRIPT}</script>'
     for caption, png in figures.items():
         code = base64.b64encode(png).decode()
-        parts.append(f'<h2>{html.escape(caption)}</h2><img alt="{html.escape(caption)}" src="data:image/png;base64,{code}">')
+        parts.append(
+            f'<h2>{html.escape(caption)}</h2><img alt="{html.escape(caption)}" src="data:image/png;base64,{code}">'
+        )
     rows = "".join(f'<tr><td>{html.escape(k)}</td><td class="n">{v}</td></tr>' for k, v in sorted(skipped.items()))
     parts.append(
         f'<h2>Skipped</h2><div class="scroll"><table><tr><th>reason</th><th>count</th></tr>{rows}</table></div>'
@@ -125,12 +130,24 @@ def _map_data(topo: TopoMap, true_trees: Array | None) -> dict[str, object]:
         if np.isfinite(topo.cov[i]).all():
             values, vectors = np.linalg.eigh(topo.cov[i, :2, :2])
             rx, ry = np.sqrt(5.991 * np.maximum(values[::-1], 0))
-            ellipse = [round(float(rx), 5), round(float(ry), 5), round(float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))), 1)]
+            ellipse = [
+                round(float(rx), 5),
+                round(float(ry), 5),
+                round(float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))), 1),
+            ]
             sigma = f", σ {100 * np.sqrt(max(values)):.1f} cm"
         place = "" if topo.datum is None else f", {geodetic[i, 0]:.7f}°, {geodetic[i, 1]:.7f}°"
         row = "" if topo.row[i] < 0 else f", row {topo.row[i]}"
         text = f"tree {topo.ids[i]}: Ø {100 * d:.0f} cm, {topo.sightings[i]} sightings{sigma}{row}{place}"
-        trees.append({"x": round(float(topo.p[i, 0]), 3), "y": round(float(topo.p[i, 1]), 3), "d": round(d, 3), "e": ellipse, "t": text})
+        trees.append(
+            {
+                "x": round(float(topo.p[i, 0]), 3),
+                "y": round(float(topo.p[i, 1]), 3),
+                "d": round(d, 3),
+                "e": ellipse,
+                "t": text,
+            }
+        )
     every = max(1, len(topo.stamps_ns) // 3000)
     track = topo.map_T_robot[::every, :2, 3]
     return {

@@ -30,7 +30,7 @@ def detect(
     far = np.hypot(p[:, 0], p[:, 1])
     bearing = np.arctan2(p[:, 1], p[:, 0])
     half = 0.5 * orchard.diameters / np.maximum(far, 0.5)
-    keep = []
+    keep: list[int] = []
     for i in np.argsort(far):
         if far[i] > noise.view or far[i] < 0.7 or rng.random() < noise.miss:
             continue

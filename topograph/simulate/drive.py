@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
@@ -45,7 +46,7 @@ def drive(orchard: Orchard, config: DriveConfig, seed: int) -> Drive:
 
 def _waypoints(orchard: Orchard, run: int) -> Array:
     c = orchard.config
-    length, first, last = (c.columns - 1) * c.tree_spacing, -3.0, (c.columns - 1) * c.tree_spacing + 3.0
+    first, last = -3.0, (c.columns - 1) * c.tree_spacing + 3.0
     last += 0.5 * c.tree_spacing if c.layout == "irregular" else 0.0
     alleys = [(k + 0.5) * c.row_spacing for k in range(max(c.rows - 1, 1))]
     if len(alleys) == 3:
@@ -63,20 +64,18 @@ def _waypoints(orchard: Orchard, run: int) -> Array:
         x = np.linspace(first, last, 40)
         sides = [np.stack([x, y + 0.7 * np.sin(x)], axis=1) for y in alleys[:2]]
         return np.concatenate([sides[0], sides[1][::-1], sides[0][:1]])
-    x = first + c.tree_spacing * np.arange(c.columns + 1)
+    crossings = first + 3.0 + c.tree_spacing * (np.arange(c.columns + 1) - 0.5)
     half = 0.5 * c.row_spacing
-    x = x + (3.0 - 0.5 * c.tree_spacing)
     rows = [1, min(2, c.rows - 1)] if c.rows > 2 else [0, c.rows - 1]
     out: list[tuple[float, float]] = []
     for k, row in enumerate(rows):
         # Cross each row midway between its trees.
         shift = 0.5 * c.tree_spacing * (row % 2) if c.layout == "irregular" else 0.0
-        zigzag = [(xi + shift, row * c.row_spacing + half * (-1) ** i) for i, xi in enumerate(x)]
-        middle = [((a[0] + b[0]) / 2, (a[1] + b[1]) / 2) for a, b in zip(zigzag, zigzag[1:], strict=False)]
+        zigzag = [(xi + shift, row * c.row_spacing + half * (-1) ** i) for i, xi in enumerate(crossings)]
+        middle = [((a[0] + b[0]) / 2, (a[1] + b[1]) / 2) for a, b in pairwise(zigzag)]
         mixed = [p for pair in zip(zigzag, middle, strict=False) for p in pair] + [zigzag[-1]]
         out += mixed if k == 0 else mixed[::-1]
     out += [(first - 1.5, out[0][1]), out[0]]
-    del length
     return np.array(out)
 
 

@@ -46,7 +46,9 @@ def sweep(orchard: Orchard, config: SensorConfig, world_T_lidar: Array, time_s: 
     ]
     blobs = np.concatenate([shapes.blobs, np.array(moving).reshape(-1, 9)])
     centre = world_T_lidar[len(world_T_lidar) // 2, :3, 3]
-    lists = [_near(a, centre, size, config.max_range) for a, size in _bounds(Shapes(shapes.cylinders, blobs, shapes.boxes))]
+    lists = [
+        _near(a, centre, size, config.max_range) for a, size in _bounds(Shapes(shapes.cylinders, blobs, shapes.boxes))
+    ]
     g = orchard.ground
     xyz, laser, column, intensity, tree = _cast(
         np.ascontiguousarray(world_T_lidar), angles, shapes.cylinders, blobs, shapes.boxes, *lists,
@@ -60,14 +62,19 @@ def sweep(orchard: Orchard, config: SensorConfig, world_T_lidar: Array, time_s: 
 def _walker(orchard: Orchard, start: Array, velocity: Array, time_s: float) -> list[list[float]]:
     back_and_forth = 20.0 * (1 - np.abs((time_s / 20.0) % 2 - 1))
     xy = start + velocity * back_and_forth
-    return person(np.array([*xy, float(orchard.ground.at(xy))]), float(np.arctan2(velocity[1], velocity[0])) + np.pi / 2)
+    return person(
+        np.array([*xy, float(orchard.ground.at(xy))]), float(np.arctan2(velocity[1], velocity[0])) + np.pi / 2
+    )
 
 
 def _bounds(s: Shapes) -> list[tuple[Array, Array]]:
     """Centre (N, 3) and bounding radius (N,) of each kind of shape."""
     c = s.cylinders
     return [
-        (c[:, :3] + 0.5 * c[:, 6:7] * c[:, 3:6], 0.5 * c[:, 6] * np.hypot(c[:, 3], c[:, 4]) + np.maximum(c[:, 7], c[:, 8])),
+        (
+            c[:, :3] + 0.5 * c[:, 6:7] * c[:, 3:6],
+            0.5 * c[:, 6] * np.hypot(c[:, 3], c[:, 4]) + np.maximum(c[:, 7], c[:, 8]),
+        ),
         (s.blobs[:, :3], np.maximum(s.blobs[:, 3], s.blobs[:, 4])),
         (s.boxes[:, :3], np.hypot(s.boxes[:, 3], s.boxes[:, 4])),
     ]
@@ -95,7 +102,7 @@ def _near(centres: Array, eye: Array, radius: Array, most: float) -> NDArray[np.
 
 
 @njit(cache=True)
-def _ground_at(x, y, origin, height):  # type: ignore[no-untyped-def]
+def _ground_at(x, y, origin, height):
     gx, gy = (x - origin[0]) / CELL, (y - origin[1]) / CELL
     ny, nx = height.shape
     j, i = min(max(int(gx), 0), nx - 2), min(max(int(gy), 0), ny - 2)
@@ -106,7 +113,7 @@ def _ground_at(x, y, origin, height):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _cylinder(o, d, c):  # type: ignore[no-untyped-def]
+def _cylinder(o, d, c):
     """Distance along the ray to a tapered cylinder, or a negative number."""
     ox, oy, oz = o[0] - c[0], o[1] - c[1], o[2] - c[2]
     da = d[0] * c[3] + d[1] * c[4] + d[2] * c[5]
@@ -129,7 +136,7 @@ def _cylinder(o, d, c):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _blob(o, d, e):  # type: ignore[no-untyped-def]
+def _blob(o, d, e):
     """Distance to a random leaf on the chord through a porous ellipsoid, or a negative number."""
     a = (d[0] / e[3]) ** 2 + (d[1] / e[4]) ** 2 + (d[2] / e[5]) ** 2
     x, y, z = o[0] - e[0], o[1] - e[1], o[2] - e[2]
@@ -145,7 +152,7 @@ def _blob(o, d, e):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _box(o, d, q):  # type: ignore[no-untyped-def]
+def _box(o, d, q):
     c, s = np.cos(q[6]), np.sin(q[6])
     x, y, z = o[0] - q[0], o[1] - q[1], o[2] - q[2]
     ro = (c * x + s * y, -s * x + c * y, z)
@@ -165,7 +172,7 @@ def _box(o, d, q):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _trace(o, d, cyl, blob, box, near_c, near_b, near_x, origin, height, grass, most):  # type: ignore[no-untyped-def]
+def _trace(o, d, cyl, blob, box, near_c, near_b, near_x, origin, height, grass, most):
     """Distance, material and tree of the first thing on a ray; distance `most` when there is none."""
     best, material, tree = most, -1, -1
     b = int((np.arctan2(d[1], d[0]) + np.pi) / (2 * np.pi) * _BINS) % _BINS
@@ -227,7 +234,7 @@ def _trace(o, d, cyl, blob, box, near_c, near_b, near_x, origin, height, grass, 
 
 @njit(cache=True)
 def _cast(poses, angles, cyl, blob, box, near_c, near_b, near_x, origin, height, grass,
-          most, sigma, dropout, divergence, seed):  # type: ignore[no-untyped-def]  # fmt: skip
+          most, sigma, dropout, divergence, seed):  # fmt: skip
     np.random.seed(seed)
     columns, lasers = poses.shape[0], angles.shape[0]
     n_max = columns * lasers
@@ -242,7 +249,13 @@ def _cast(poses, angles, cyl, blob, box, near_c, near_b, near_x, origin, height,
         R = T[:3, :3].copy()
         for las in range(lasers):
             azimuth = -2.0 * np.pi * (col + las / (1.5 * lasers)) / columns
-            s = np.array([np.cos(angles[las]) * np.cos(azimuth), np.cos(angles[las]) * np.sin(azimuth), np.sin(angles[las])])
+            s = np.array(
+                [
+                    np.cos(angles[las]) * np.cos(azimuth),
+                    np.cos(angles[las]) * np.sin(azimuth),
+                    np.sin(angles[las]),
+                ]
+            )
             d = R @ s
             side = np.array([-d[1], d[0], 0.0])
             a = divergence * np.random.uniform(-1.0, 1.0)

@@ -95,7 +95,7 @@ def _places(config: OrchardConfig, rng: np.random.Generator) -> Array:
     xy = np.stack([i.ravel() * config.tree_spacing, j.ravel() * config.row_spacing], axis=1).astype(float)
     if config.layout == "irregular":
         xy[:, 0] += 0.5 * config.tree_spacing * (j.ravel() % 2)
-    xy += rng.normal(0, config.jitter, xy.shape).clip(-2.2 * config.jitter, 2.2 * config.jitter)
+    xy += np.clip(rng.normal(0, config.jitter, xy.shape), -2.2 * config.jitter, 2.2 * config.jitter)
     return np.asarray(xy[rng.random(len(xy)) >= config.gaps])
 
 
@@ -135,11 +135,13 @@ class _Build:
         return np.array([xy[0], xy[1], float(self.ground.at(np.asarray(xy)))])
 
     def _direction(self, tilt: float) -> Array:
-        t = self.rng.normal(0, tilt, 2).clip(-2.5 * tilt, 2.5 * tilt)
+        t = np.clip(self.rng.normal(0, tilt, 2), -2.5 * tilt, 2.5 * tilt)
         d = np.array([t[0], t[1], 1.0])
         return np.asarray(d / np.linalg.norm(d))
 
-    def _cylinder(self, foot: Array, axis: Array, length: float, r0: float, r1: float, material: int, tree: int = -1) -> None:
+    def _cylinder(
+        self, foot: Array, axis: Array, length: float, r0: float, r1: float, material: int, tree: int = -1
+    ) -> None:
         self.cylinders.append([*foot, *axis, length, r0, r1, material, tree])
 
     def tree(self, config: OrchardConfig, xy: Array, number: int) -> tuple[Array, Array, float, int]:
@@ -166,7 +168,9 @@ class _Build:
             upper = axis + bend
             upper /= np.linalg.norm(upper)
             self._cylinder(sunk, axis, middle + 0.3, 1.12 * r, 0.97 * r, TRUNK, number)
-            self._cylinder(foot + middle * axis, upper, max(fork - middle, 0.1) + 0.3, 0.97 * r, 0.85 * r, TRUNK, number)
+            self._cylinder(
+                foot + middle * axis, upper, max(fork - middle, 0.1) + 0.3, 0.97 * r, 0.85 * r, TRUNK, number
+            )
         top = foot + fork * axis
         for _ in range(int(rng.integers(2, 5))):
             d = self._direction(0.6)
@@ -199,10 +203,10 @@ class _Build:
         rng = self.rng
         for _ in range(config.posts):
             self._cylinder(self._foot(self._anywhere(places, 0.9)) - [0, 0, 0.2], self._direction(0.03),
-                           rng.uniform(1.3, 2.2) + 0.2, *[rng.uniform(0.035, 0.06)] * 2, WOOD)  # fmt: skip
+                           rng.uniform(1.3, 2.2) + 0.2, r := rng.uniform(0.035, 0.06), r, WOOD)  # fmt: skip
         for _ in range(config.poles):
             self._cylinder(self._foot(self._anywhere(places, 1.5)) - [0, 0, 0.2], self._direction(0.01),
-                           rng.uniform(5, 8), *[rng.uniform(0.08, 0.14)] * 2, METAL)  # fmt: skip
+                           rng.uniform(5, 8), r := rng.uniform(0.08, 0.14), r, METAL)  # fmt: skip
         for _ in range(config.people):
             self.blobs.extend(person(self._foot(self._anywhere(places, 1.2)), rng.uniform(0, 2 * np.pi)))
         for _ in range(config.vehicles):

@@ -100,20 +100,36 @@ def _small(bag: BagWriter, way: Drive, sensor: SensorConfig, datum: Datum, rng: 
     ]  # fmt: skip
     if sensor.heading_sigma > 0:
         streams.append(
-            events(s_head, 60_000_000, lambda k, s: bag.heading("/gnss/heading", s + 60_000_000, s, "gnss_baseline", turn[k]))
+            events(
+                s_head,
+                60_000_000,
+                lambda k, s: bag.heading("/gnss/heading", s + 60_000_000, s, "gnss_baseline", turn[k]),
+            )
         )
     return heapq.merge(*streams, key=lambda e: e[0])
 
 
 def _clouds(
-    bag: BagWriter, scene: Orchard, way: Drive, sensor: SensorConfig, seed: int, seen: list[Any], stamps: list[int]
+    bag: BagWriter,
+    scene: Orchard,
+    way: Drive,
+    sensor: SensorConfig,
+    seed: int,
+    seen: list[Any],
+    stamps: list[int],
 ) -> Iterator[Event]:
     span = int(1e9 / sensor.sweep_hz)
     for k, start in enumerate(range(int(way.stamps_ns[0]), int(way.stamps_ns[-1]) - span, span)):
         end = start + span  # velodyne_driver stamps the last packet: times are negative
 
         def write(k: int = k, start: int = start, end: int = end) -> None:
-            s = sweep(scene, sensor, sensors.columns(way, sensor, start), (start - way.stamps_ns[0]) * 1e-9, seed * 100_003 + k)
+            s = sweep(
+                scene,
+                sensor,
+                sensors.columns(way, sensor, start),
+                (start - way.stamps_ns[0]) * 1e-9,
+                seed * 100_003 + k,
+            )
             bag.points("/velodyne_points", end + 5_000_000, end, "velodyne", _view(s, span * 1e-9))
             stamps.append(end)
             seen.append(np.bincount(s.tree[s.tree >= 0], minlength=len(scene.trees))[: len(scene.trees)])
@@ -130,7 +146,12 @@ def _view(s: Sweep, span_s: float) -> Any:
 
 
 def _trunks(
-    bag: BagWriter, scene: Orchard, way: Drive, sensor: SensorConfig, noise: DetectionNoise, rng: np.random.Generator
+    bag: BagWriter,
+    scene: Orchard,
+    way: Drive,
+    sensor: SensorConfig,
+    noise: DetectionNoise,
+    rng: np.random.Generator,
 ) -> Iterator[Event]:
     span = int(1e9 / sensor.sweep_hz)
     stamps = np.arange(int(way.stamps_ns[0]), int(way.stamps_ns[-1]), span, dtype=np.int64)

@@ -67,7 +67,11 @@ def wheels(drive: Drive, config: SensorConfig, rng: np.random.Generator) -> Whee
     pose = np.zeros((len(i), 3))
     for k in range(len(forward)):
         x, y, a = pose[k]
-        pose[k + 1] = x + forward[k] * np.cos(a + turn[k] / 2), y + forward[k] * np.sin(a + turn[k] / 2), a + turn[k]
+        pose[k + 1] = (
+            x + forward[k] * np.cos(a + turn[k] / 2),
+            y + forward[k] * np.sin(a + turn[k] / 2),
+            a + turn[k],
+        )
     twist = np.zeros((len(i), 6))
     twist[1:, 0], twist[1:, 5] = forward / dt, turn / dt
     return Wheels(drive.stamps_ns[i], planar(*pose.T), twist)
@@ -90,8 +94,15 @@ def imu(drive: Drive, config: SensorConfig, rng: np.random.Generator) -> tuple[S
     def walk(sigma: float) -> Array:  # in-run instability: a slow random walk
         return np.cumsum(rng.normal(0, sigma / np.sqrt(100 * config.imu_hz), (n, 3)), axis=0)
 
-    gyro_i = gyro[i] + rng.normal(0, config.gyro_bias, 3) + walk(5e-5) + rng.normal(0, config.gyro_density * root, (n, 3))
-    accel_i = accel[i] + rng.normal(0, config.accel_bias, 3) + walk(1.5e-4) + rng.normal(0, config.accel_density * root, (n, 3))
+    gyro_i = (
+        gyro[i] + rng.normal(0, config.gyro_bias, 3) + walk(5e-5) + rng.normal(0, config.gyro_density * root, (n, 3))
+    )
+    accel_i = (
+        accel[i]
+        + rng.normal(0, config.accel_bias, 3)
+        + walk(1.5e-4)
+        + rng.normal(0, config.accel_density * root, (n, 3))
+    )
     shake = moving[i][:, None]
     gyro_i += shake * rng.normal(0, 0.02 * config.vibration, (n, 3))
     accel_i += shake * rng.normal(0, config.vibration, (n, 3))

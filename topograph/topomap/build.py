@@ -30,15 +30,14 @@ def build(
     """The map of an estimate. `trunks` are the scans' trunks with their clouds, in the order of `detections`."""
     n = len(estimate.trees)
     tree, axes, hits = estimate.tree, np.zeros((n, 3)), np.zeros(n, np.int64)
-    diameter, height = np.full(n, np.nan), np.zeros(n)
+    diameter, height, spread = np.full(n, np.nan), np.zeros(n), np.zeros(n)
     map_axis = (map_T_scan[detections.scan, :3, :3] @ detections.axis[:, :, None])[..., 0]
     order = np.argsort(tree, kind="stable")
     ends = np.searchsorted(tree[order], np.arange(n + 1))
     for j in range(n):
         mine = order[ends[j] : ends[j + 1]]
         hits[j] = len(mine)
-        axes[j] = np.median(map_axis[mine], axis=0) if len(mine) else (0.0, 0.0, 1.0)
-        axes[j] /= np.linalg.norm(axes[j])
+        axes[j], spread[j] = _axis(map_axis[mine], detections.p[mine])
         known = detections.diameter[mine][np.isfinite(detections.diameter[mine])]
         diameter[j] = np.median(known) if len(known) else np.nan
         above = detections.height[mine][np.isfinite(detections.height[mine])]
@@ -46,7 +45,7 @@ def build(
     foot = estimate.trees - axes * (height / np.maximum(axes[:, 2], 0.3))[:, None]
     cov = estimate.tree_cov.copy()
     # The foot lies `height` below what was measured: the lean's error carries over.
-    lean_var = (0.03 * height) ** 2
+    lean_var = (height * np.hypot(0.02, 0.4 * spread)) ** 2
     cov[:, [0, 1], [0, 1]] += lean_var[:, None]
     viewpoints = _viewpoints(foot, tree, detections, trunks, map_T_scan, config)
     edges = neighbours(foot[:, :2], config)
@@ -56,6 +55,21 @@ def build(
         np.linalg.norm(foot[edges[:, 0]] - foot[edges[:, 1]], axis=1), viewpoints, estimate.stamps_ns,
         estimate.map_T_robot, estimate.datum_cov, meta,
     )  # fmt: skip
+
+
+def _axis(axes: Array, p: Array) -> tuple[Array, float]:
+    """Axis (3,) of one tree and its uncertainty, rad, from sightings' axes (N, 3) in the map frame, seen at `p` (N, 3).
+
+    From afar one or two rings cross a trunk and its lean is a guess; the nearest third of the sightings decides.
+    """
+    if len(axes) == 0:
+        return np.array([0.0, 0.0, 1.0]), 0.1
+    far = np.hypot(p[:, 0], p[:, 1])
+    near = axes[far <= max(float(np.percentile(far, 33)), 4.0)]
+    mean = np.median(near, axis=0)
+    # Stems and bends: the views do not agree on one axis, however many they are.
+    spread = 1.4826 * float(np.median(np.linalg.norm(near[:, :2] - mean[:2], axis=1))) / 1.177
+    return np.asarray(mean / np.linalg.norm(mean)), spread
 
 
 def _viewpoints(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +76,7 @@ def _delaunay_pairs(xy: Array) -> NDArray[np.int64]:
         else:
             main = np.linalg.svd(xy - xy.mean(0), full_matrices=False)[2][0]
             order = np.argsort(xy @ main)
-            pairs = [tuple(sorted((int(a), int(b)))) for a, b in zip(order, order[1:], strict=False)]
+            pairs = [(min(a, b), max(a, b)) for a, b in pairwise(order.tolist())]
         return np.array(pairs, np.int64).reshape(-1, 2)
     edges = np.concatenate([simplices[:, [0, 1]], simplices[:, [1, 2]], simplices[:, [2, 0]]])
     return np.asarray(np.unique(np.sort(edges, axis=1), axis=0), np.int64)

@@ -36,7 +36,9 @@ def merge(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64], config: To
     for v in new.viewpoints:
         moved = Viewpoint(int(row_of_new[v.tree]), v.direction, v.cloud)
         twin = [
-            i for i, o in enumerate(views) if o.tree == moved.tree and float(o.direction @ v.direction) > config.viewpoint_cosine
+            i
+            for i, o in enumerate(views)
+            if o.tree == moved.tree and float(o.direction @ v.direction) > config.viewpoint_cosine
         ]
         if not twin:
             views.append(moved)

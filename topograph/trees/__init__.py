@@ -8,4 +8,17 @@ from topograph.trees.refine import refine
 from topograph.trees.sightings import Sightings, gather
 from topograph.trees.tracks import TreesConfig, follow
 
-__all__ = ["Detections", "LoopCloser", "Sightings", "TrackTable", "TreesConfig", "choose_keyframes", "exists", "follow", "gather", "moved_pose", "refine", "tabulate"]
+__all__ = [
+    "Detections",
+    "LoopCloser",
+    "Sightings",
+    "TrackTable",
+    "TreesConfig",
+    "choose_keyframes",
+    "exists",
+    "follow",
+    "gather",
+    "moved_pose",
+    "refine",
+    "tabulate",
+]

@@ -32,7 +32,9 @@ def exists(
     expected = (chance > 0.35) & ~_hidden(far, bearing)
     shown = np.sum(expected, axis=0)
     found = np.sum(expected & seen, axis=0)
-    enough = hits >= config.min_sightings
+    # A few false detections may fall on one spot; a tree of the run's own kind is seen far more often.
+    typical = float(np.median(hits[hits >= config.min_sightings])) if (hits >= config.min_sightings).any() else 0.0
+    enough = hits >= max(config.min_sightings, config.min_share * typical)
     ratio = found / np.maximum(shown, 1)
     scored = bool(np.any(detections.score != 0.0))  # recorded detections may come without
     ok = enough & ((score >= config.min_score) | (not scored)) & ((ratio >= config.min_ratio) | (shown < 4))

@@ -114,7 +114,9 @@ def moved_pose(pose: Array, centre: Array, move: Array) -> Array:
     return np.asarray(out)
 
 
-def _centres(t: TrackTable, tree: NDArray[np.int64], chosen: NDArray[np.bool_]) -> tuple[Array, NDArray[np.int64], Array]:
+def _centres(
+    t: TrackTable, tree: NDArray[np.int64], chosen: NDArray[np.bool_]
+) -> tuple[Array, NDArray[np.int64], Array]:
     """Place (K, 2), id (K,) and sigma (K,) of the trees that the chosen tracks belong to."""
     ids, index = np.unique(tree[chosen], return_inverse=True)
     w = t.hits[chosen].astype(float)
@@ -222,7 +224,7 @@ def _settle(
     target = np.asarray(tree.data)
     for gate in (1.5, 0.8, 0.5):
         moved = _apply(move, here, centre)
-        distance, j = tree.query(moved, distance_upper_bound=gate)
+        distance, j = _nearest(tree, moved, gate)
         pairs = _one_to_one(distance, j)
         if len(pairs) < 2:
             break
@@ -230,7 +232,7 @@ def _settle(
         x, y, turn = fit_rigid_2d(here[i_] - centre, target[j_] - centre)
         move = np.array([x, y, turn])
     moved = _apply(move, here, centre)
-    distance, j = tree.query(moved, distance_upper_bound=1.5)
+    distance, j = _nearest(tree, moved, 1.5)
     pairs = _one_to_one(distance, j)
     score = -0.5 * float(move[:2] @ move[:2]) / sigma**2 - 0.5 * float(move[2] / yaw_sigma) ** 2
     kept = []
@@ -244,6 +246,11 @@ def _settle(
     return move, score, kept
 
 
+def _nearest(tree: cKDTree, points: Array, most: float) -> tuple[Array, NDArray[np.intp]]:
+    distance, j = tree.query(points, distance_upper_bound=most)
+    return np.asarray(distance, float), np.asarray(j, np.intp)
+
+
 def _one_to_one(distance: Array, j: NDArray[np.intp]) -> list[tuple[int, int]]:
     taken: dict[int, int] = {}
     for i in np.argsort(distance).tolist():
@@ -252,9 +259,7 @@ def _one_to_one(distance: Array, j: NDArray[np.intp]) -> list[tuple[int, int]]:
     return [(i, k) for k, i in taken.items()]
 
 
-def tabulate(
-    detection_xy: Array, variance: Array, track: NDArray[np.int64], distance: Array
-) -> TrackTable:
+def tabulate(detection_xy: Array, variance: Array, track: NDArray[np.int64], distance: Array) -> TrackTable:
     """Table of tracks 0..T-1 from their detections: map positions (N, 2), variances (N,) and distances driven (N,)."""
     n = int(track.max(initial=-1)) + 1
     hits = np.bincount(track, minlength=n)

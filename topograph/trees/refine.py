@@ -11,7 +11,12 @@ from topograph.trees.tracks import TreesConfig
 
 
 def refine(
-    place: Array, sigma: Array, hits: NDArray[np.int64], tree: NDArray[np.int64], config: TreesConfig, patience: float = 0.0
+    place: Array,
+    sigma: Array,
+    hits: NDArray[np.int64],
+    tree: NDArray[np.int64],
+    config: TreesConfig,
+    patience: float = 0.0,
 ) -> NDArray[np.int64]:
     """Tree (T,) of each track, renumbered from 0, given the tracks' places (T, 2), sigmas and hits in the solved map.
 
@@ -44,7 +49,12 @@ def refine(
 
 
 def _leave(
-    place: Array, sigma: Array, hits: NDArray[np.int64], tree: NDArray[np.int64], config: TreesConfig, patience: float
+    place: Array,
+    sigma: Array,
+    hits: NDArray[np.int64],
+    tree: NDArray[np.int64],
+    config: TreesConfig,
+    patience: float,
 ) -> NDArray[np.int64]:
     fresh = int(tree.max(initial=0)) + 1
     order = np.argsort(tree, kind="stable")

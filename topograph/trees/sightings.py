@@ -42,7 +42,12 @@ def nearest_keyframe(stamps: NDArray[np.int64], keyframes_ns: NDArray[np.int64])
 
 
 def gather(
-    detections: Detections, tree: NDArray[np.int64], keyframes_ns: NDArray[np.int64], motion: Motion, *, independent: float = 0.25
+    detections: Detections,
+    tree: NDArray[np.int64],
+    keyframes_ns: NDArray[np.int64],
+    motion: Motion,
+    *,
+    independent: float = 0.25,
 ) -> Sightings:
     """Sightings of the detections with `tree` (N,) >= 0.
 
@@ -67,4 +72,4 @@ def gather(
     mean = np.linalg.solve(total, weighted[..., None])[..., 0] if m else np.zeros((0, 3))
     effective = 1 + independent * (count - 1)
     cov = np.linalg.inv(total) * (count / effective)[:, None, None] if m else np.zeros((0, 3, 3))
-    return Sightings(keyframe[first], tree[keep][first], mean, cov, count)
+    return Sightings(keyframe[first], tree[keep][first], np.asarray(mean, float), np.asarray(cov, float), count)

@@ -27,7 +27,8 @@ class TreesConfig:
         mapped: chance that a trunk seen on old ground is already in the map.
         margin: log-odds by which a loop must beat its rivals and the absence of a loop.
         merge: two trees nearer than this are one (stems of one tree), m.
-        min_sightings, min_score, min_ratio: of a tree that exists; ratio of sightings to scans that should show it.
+        min_sightings, min_score, min_ratio: of a tree that exists; ratio of sightings to scans that should show it;
+        min_share: of the sightings that trees of the same run have at the median.
     """
 
     gate: float = 11.8
@@ -42,6 +43,7 @@ class TreesConfig:
     min_sightings: int = 6
     min_score: float = 1.15
     min_ratio: float = 0.15
+    min_share: float = 0.03
 
 
 def follow(detections: Detections, motion: Motion, config: TreesConfig) -> NDArray[np.int64]:
@@ -80,7 +82,10 @@ def follow(detections: Detections, motion: Motion, config: TreesConfig) -> NDArr
         born += len(new)
         ids = np.concatenate([ids, track[new]])
         place, spread = np.concatenate([place, p[new]]), np.concatenate([spread, cov[new]])
-        seen, hits = np.concatenate([seen, np.full(len(new), distance[s])]), np.concatenate([hits, np.ones(len(new))])
+        seen, hits = (
+            np.concatenate([seen, np.full(len(new), distance[s])]),
+            np.concatenate([hits, np.ones(len(new))]),
+        )
     return track
 
 
@@ -91,7 +96,9 @@ def _planar_cov(detections: Detections, odom_T_robot: Array) -> Array:
     return np.asarray((R @ detections.cov @ np.swapaxes(R, 1, 2))[:, :2, :2])
 
 
-def _match(p: Array, cov: Array, place: Array, spread: Array, since: Array, config: TreesConfig) -> list[tuple[int, int]]:
+def _match(
+    p: Array, cov: Array, place: Array, spread: Array, since: Array, config: TreesConfig
+) -> list[tuple[int, int]]:
     if len(place) == 0:
         return []
     d = p[:, None] - place[None]

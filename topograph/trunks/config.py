@@ -10,7 +10,6 @@ class TrunksConfig:
     """The front end; lengths in m.
 
     Attributes:
-        front_end: "organised" (ours) or "thesis" (Algorithms 1 and 2).
         nearest, farthest: distances between which trunks are looked for.
         low, high: heights above ground between which a trunk is traced.
         reference: height above ground at which the axis is stated.
@@ -23,7 +22,6 @@ class TrunksConfig:
         recorded_reach: recorded detections beyond are left out.
     """
 
-    front_end: str = "organised"
     nearest: float = 0.8
     farthest: float = 30.0
     low: float = 0.25

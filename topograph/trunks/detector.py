@@ -46,7 +46,14 @@ def candidates(scan: Scan, base_T_lidar: Array, twist: Array, config: TrunksConf
     ring, n_rings = rings_of(scan)
     offset = _NO_TIME if scan.offset is None else scan.offset
     p, r, a, starts = organise(
-        scan.xyz, ring, offset, base_T_lidar, np.asarray(twist, float), n_rings, config.nearest, config.farthest + 8.0
+        scan.xyz,
+        ring,
+        offset,
+        base_T_lidar,
+        np.asarray(twist, float),
+        n_rings,
+        config.nearest,
+        config.farthest + 8.0,
     )
     if len(p) < 50:
         return Candidates(np.zeros((0, 16)), np.zeros((0, len(FEATURES))), p, [])
@@ -150,6 +157,8 @@ def trunks_of(
 def warm_up() -> None:
     """Compile the hot loops on a made-up sweep, so that no measured sweep pays for it."""
     az = np.linspace(-3.1, 3.1, 600)
-    xyz = np.concatenate([np.stack([5 * np.cos(az), 5 * np.sin(az), np.full(600, -0.8 + 0.2 * k)], 1) for k in range(4)])
+    xyz = np.concatenate(
+        [np.stack([5 * np.cos(az), 5 * np.sin(az), np.full(600, -0.8 + 0.2 * k)], 1) for k in range(4)]
+    )
     scan = Scan(1, "lidar", xyz.astype(np.float32), np.repeat(np.arange(4), 600).astype(np.int32), None, None)
     candidates(scan, np.eye(4), np.zeros(6), TrunksConfig())

@@ -6,7 +6,20 @@ import numpy as np
 from numba import njit
 
 from topograph.trunks.ground import ground_at
-from topograph.trunks.runs import COUNT, FIRST, FREE, HEIGHT, LAST, PX, PY, PZ, RANGE, RING, WIDTH, count_around
+from topograph.trunks.runs import (
+    COUNT,
+    FIRST,
+    FREE,
+    HEIGHT,
+    LAST,
+    PX,
+    PY,
+    PZ,
+    RANGE,
+    RING,
+    WIDTH,
+    count_around,
+)
 
 FEATURES = (
     "range", "rings", "points", "diameter", "width_spread", "rough", "line_rms", "lean", "free", "lowest", "highest",
@@ -17,7 +30,26 @@ OUT_SIZE = 16
 
 
 @njit(cache=True)
-def fit_chains(p, r, h, runs, label, chain, plane, grid, above, beside, eye, step, top, reference, prior_d, prior_s, thinnest, widest):  # type: ignore[no-untyped-def]
+def fit_chains(
+    p,
+    r,
+    h,
+    runs,
+    label,
+    chain,
+    plane,
+    grid,
+    above,
+    beside,
+    eye,
+    step,
+    top,
+    reference,
+    prior_d,
+    prior_s,
+    thinnest,
+    widest,
+):
     """Trunks (C, OUT_SIZE), features (C, len(FEATURES)) and the chain (C,) that each came from.
 
     The mean return of a cylinder of radius R lies π/4·R before its axis; R comes from the width of all rings
@@ -174,7 +206,7 @@ def fit_chains(p, r, h, runs, label, chain, plane, grid, above, beside, eye, ste
 
 
 @njit(cache=True)
-def suppress(out, score, distance):  # type: ignore[no-untyped-def]
+def suppress(out, score, distance):
     """Group (C,) of each trunk: those within `distance` m of a better one are its stems or its pieces."""
     n = out.shape[0]
     group = np.full(n, -1, np.int64)

@@ -10,7 +10,7 @@ HALF = 32
 
 
 @njit(cache=True)
-def fit_ground(p):  # type: ignore[no-untyped-def]
+def fit_ground(p):
     """Plane (3,) z = a + b x + c y, and residual heights (2·HALF, 2·HALF) on 1 m cells, all in the base's frame, m.
 
     Lowest points of cells vote; a cell that stands above its neighbours shows a thing, not the ground. Gaps are
@@ -27,9 +27,9 @@ def fit_ground(p):  # type: ignore[no-untyped-def]
     n = 0
     for i in range(size):
         for j in range(size):
-            x, y = i - HALF + 0.5, j - HALF + 0.5
-            if low[i, j] < 1e8 and x * x + y * y < 225.0:
-                xs[n], ys[n], zs[n] = x, y, low[i, j]
+            u, v = i - HALF + 0.5, j - HALF + 0.5
+            if low[i, j] < 1e8 and u * u + v * v < 225.0:
+                xs[n], ys[n], zs[n] = u, v, low[i, j]
                 n += 1
     plane = np.zeros(3)
     grid = np.zeros((size, size), np.float32)
@@ -44,7 +44,7 @@ def fit_ground(p):  # type: ignore[no-untyped-def]
     plane[0] = np.percentile(near[:m], 25) if m > 5 else np.percentile(zs[:n], 15)
     for turn in range(12):
         s = np.zeros((3, 3))
-        v = np.zeros(3)
+        t = np.zeros(3)
         width = 0.6 if turn < 4 else 0.25
         for k in range(n):
             e = zs[k] - plane[0] - plane[1] * xs[k] - plane[2] * ys[k]
@@ -56,21 +56,21 @@ def fit_ground(p):  # type: ignore[no-untyped-def]
             s[1, 1] += w * xs[k] * xs[k]
             s[1, 2] += w * xs[k] * ys[k]
             s[2, 2] += w * ys[k] * ys[k]
-            v[0] += w * zs[k]
-            v[1] += w * zs[k] * xs[k]
-            v[2] += w * zs[k] * ys[k]
+            t[0] += w * zs[k]
+            t[1] += w * zs[k] * xs[k]
+            t[2] += w * zs[k] * ys[k]
         s[1, 0], s[2, 0], s[2, 1] = s[0, 1], s[0, 2], s[1, 2]
         s[1, 1] += 1.0  # a weak pull to level: a few cells in a row fix no slope
         s[2, 2] += 1.0
         s[0, 0] += 1e-9
-        plane = np.linalg.solve(s, v)
+        plane[:] = np.linalg.solve(s, t)
     valid = np.zeros((size, size), np.bool_)
     for i in range(size):
         for j in range(size):
             if low[i, j] < 1e8:
-                x, y = i - HALF + 0.5, j - HALF + 0.5
-                e = low[i, j] - plane[0] - plane[1] * x - plane[2] * y
-                bound = 0.4 + 0.035 * np.sqrt(x * x + y * y)
+                u, v = i - HALF + 0.5, j - HALF + 0.5
+                e = low[i, j] - plane[0] - plane[1] * u - plane[2] * v
+                bound = 0.4 + 0.035 * np.sqrt(u * u + v * v)
                 if -bound - 0.3 < e < bound:
                     grid[i, j] = e
                     valid[i, j] = True
@@ -106,7 +106,7 @@ def fit_ground(p):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def ground_at(x, y, plane, grid):  # type: ignore[no-untyped-def]
+def ground_at(x, y, plane, grid):
     """Ground height at a position in the base's frame, bilinear between cell centres."""
     u, v = x + HALF - 0.5, y + HALF - 0.5
     i, j = int(np.floor(u)), int(np.floor(v))
@@ -114,4 +114,8 @@ def ground_at(x, y, plane, grid):  # type: ignore[no-untyped-def]
     if i < 0 or j < 0 or i > 2 * HALF - 2 or j > 2 * HALF - 2:
         return z
     a, b = u - i, v - j
-    return z + (1 - a) * ((1 - b) * grid[i, j] + b * grid[i, j + 1]) + a * ((1 - b) * grid[i + 1, j] + b * grid[i + 1, j + 1])
+    return (
+        z
+        + (1 - a) * ((1 - b) * grid[i, j] + b * grid[i, j + 1])
+        + a * ((1 - b) * grid[i + 1, j] + b * grid[i + 1, j + 1])
+    )

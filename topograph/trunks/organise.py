@@ -15,7 +15,7 @@ def rings_of(scan: Scan) -> tuple[NDArray[np.int32], int]:
 
     A sensor with fixed lasers shows its elevations as narrow peaks; a cloud without such peaks gets half-degree bins.
     """
-    if scan.ring is not None and len(scan.ring) and 0 <= scan.ring.min() and scan.ring.max() < 256:
+    if scan.ring is not None and len(scan.ring) and scan.ring.min() >= 0 and scan.ring.max() < 256:
         return scan.ring, int(scan.ring.max()) + 1
     xyz = scan.xyz
     with np.errstate(invalid="ignore"):
@@ -38,7 +38,7 @@ def rings_of(scan: Scan) -> tuple[NDArray[np.int32], int]:
 
 
 @njit(cache=True)
-def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):  # type: ignore[no-untyped-def]
+def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
     """Points sorted by ring, azimuth within it: base-frame xyz (M, 3), range (M,), azimuth (M,), ring starts (R+1,).
 
     `offset` (N,) s or empty; `twist` (6,) of the base. First the motion during the sweep is taken out, to second

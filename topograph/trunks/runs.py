@@ -17,7 +17,7 @@ CELLS = 8 * HALF
 
 
 @njit(cache=True)
-def heights(p, plane, grid):  # type: ignore[no-untyped-def]
+def heights(p, plane, grid):
     """Height above ground (M,) of points; counts of what is overhead (1.9-5 m) and beside (0.3-1.5 m) per 0.25 m cell."""
     m = p.shape[0]
     h = np.empty(m, np.float32)
@@ -36,7 +36,7 @@ def heights(p, plane, grid):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def count_around(cells, x, y, inner, outer):  # type: ignore[no-untyped-def]
+def count_around(cells, x, y, inner, outer):
     """Points within `inner` m, and between `inner` and `outer` m, of a position."""
     i, j = int(4.0 * (x + HALF)), int(4.0 * (y + HALF))
     near, far = 0, 0
@@ -55,7 +55,7 @@ def count_around(cells, x, y, inner, outer):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def find_runs(p, r, a, h, starts, step, low, high, widest):  # type: ignore[no-untyped-def]
+def find_runs(p, r, a, h, starts, step, low, high, widest):
     """Runs (K, RUN_SIZE) and the run (M,) of each point or -1.
 
     Columns: first and last point, ring, mean xyz (m), mean range, width, free sides, height, count, bearing. A leaf
@@ -113,7 +113,7 @@ def find_runs(p, r, a, h, starts, step, low, high, widest):  # type: ignore[no-u
 
 
 @njit(cache=True)
-def link(runs):  # type: ignore[no-untyped-def]
+def link(runs):
     """Chain (K,) of each run: runs of neighbouring rings that stand above each other are one thing."""
     k = runs.shape[0]
     chain = np.arange(k)

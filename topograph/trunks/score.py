@@ -1,4 +1,4 @@
-"""Tree or not: a small network on the features of a candidate, its weights in a text file trained by `tools/train_score.py`."""
+"""Tree or not: a small network on the features of a candidate; its weights come from `tools/train_score.py`."""
 
 from __future__ import annotations
 

@@ -1,0 +1,177 @@
+"""The commands as a user types them: exit codes, one line on what to do, results whole or not at all."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from topograph import store
+from topograph.bags.writer import BagWriter
+from topograph.cli import main
+from topograph.config import Config, dump, from_dict, load
+from topograph.errors import UsageError
+from topograph.evaluate import Truth, read_tum
+
+T0 = 1_700_000_000_000_000_000
+
+
+def call(*words: object) -> Result:
+    return CliRunner().invoke(main, [str(w) for w in words])
+
+
+def drive(path: Path, fixes: str = "good", odometry: bool = True, seconds: int = 20) -> Path:
+    """A bag without trunks: a straight drive with fixes of the wanted kind."""
+    from topograph.geometry import Datum
+
+    enu = np.stack([np.arange(0, seconds, 0.2), np.zeros(5 * seconds), np.zeros(5 * seconds)], axis=1)
+    g = Datum(40.0, -8.0, 50.0).to_geodetic(enu)
+    with BagWriter(path) as w:
+        for k in range(5 * seconds):
+            s = T0 + k * 200_000_000
+            T = np.eye(4)
+            T[0, 3] = 0.2 * k
+            if odometry:
+                w.odometry("/odom", s, s, ("odom", "base_link"), T, np.array([1.0, 0, 0, 0, 0, 0]))
+            cov = np.diag([1e-4, 1e-4, 4e-4])
+            if fixes == "bad":
+                cases = [
+                    (g[k], cov, -1),
+                    (np.full(3, np.nan), cov, 2),
+                    (g[k], np.full((3, 3), np.nan), 2),
+                    (g[k], 1e9 * np.eye(3), 2),
+                ]
+                z, c, status = cases[k % 4]
+                w.fix("/fix", s, s, "gnss", z, c, status)
+            elif fixes == "good":
+                w.fix("/fix", s, s, "gnss", g[k], cov, 2)
+    return path
+
+
+def test_map_of_a_run(tmp_path: Path, detections_run: tuple[Path, Truth]) -> None:
+    path, truth = detections_run
+    out = call("map", path, "-o", tmp_path / "m.gpkg", "--results", tmp_path, "--truth", f"{path}.truth", "-q")
+    assert out.exit_code == 0, out.output
+    topo = store.load(tmp_path / "m.gpkg")
+    assert len(topo) == len(truth.trees)
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert {"metrics", "skipped", "inputs", "seconds", "peak_rss_mb"} <= set(report)
+    assert {m["name"] for m in report["metrics"]} >= {"tree error mean", "tree precision", "tree recall"}
+    stamps, poses = read_tum(tmp_path / "path.tum")
+    assert len(stamps) == len(poses) > 50
+    page = (tmp_path / "report.html").read_text()
+    assert "http://" not in page.replace("http://www.w3.org/2000/svg", "")
+    assert "https://" not in page
+    assert load(tmp_path / "config.yaml") == Config()
+    for name in ("trees.geojson", "trees.csv", "path.tum"):
+        assert call("export", tmp_path / "m.gpkg", tmp_path / ("x" + name)).exit_code == 0
+    assert call("view", tmp_path / "m.gpkg", tmp_path / "view.html").exit_code == 0
+    again = call("map", path, "--into", tmp_path / "m.gpkg", "--results", tmp_path / "2", "-q")
+    assert again.exit_code == 0, again.output
+    extended = store.load(tmp_path / "m.gpkg")
+    assert len(extended) == len(topo)
+    np.testing.assert_array_equal(extended.ids, topo.ids)
+    assert (extended.sightings > topo.sightings).all()
+    assert np.linalg.norm(extended.p - topo.p, axis=1).max() < 0.05
+
+
+def test_compare_prints_both(tmp_path: Path, detections_run: tuple[Path, Truth]) -> None:
+    path, _ = detections_run
+    out = call("compare", path, "--truth", f"{path}.truth", "--results", tmp_path, "-q")
+    assert out.exit_code == 0, out.output
+    assert "thesis" in out.output
+    assert (tmp_path / "comparison.png").stat().st_size > 1000
+
+
+def test_no_trunks_is_said(tmp_path: Path) -> None:
+    bag = drive(tmp_path / "a.bag")
+    out = call("map", bag, "-o", tmp_path / "m.gpkg", "--results", tmp_path / "r", "-q")
+    assert out.exit_code == 4
+    assert "no trunks" in out.output
+    assert not (tmp_path / "m.gpkg").exists()
+    stamps, poses = read_tum(tmp_path / "r" / "path.tum")
+    assert abs(poses[-1, 0, 3] - poses[0, 0, 3]) == pytest.approx((stamps[-1] - stamps[0]) * 1e-9, rel=0.02)
+
+
+def test_bad_fixes_are_counted_and_the_map_is_local(tmp_path: Path) -> None:
+    bag = drive(tmp_path / "a.bag", fixes="bad")
+    out = call("map", bag, "--results", tmp_path / "r", "-q")
+    assert out.exit_code == 4
+    report = json.loads((tmp_path / "r" / "report.json").read_text())
+    assert sum(v for k, v in report["skipped"].items() if k.startswith("fix")) == 100
+    assert any("not georeferenced" in n for n in report["notes"])
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        (["map", "nothing.bag"], 3, "no such file"),
+        (["map", "{no_motion}"], 4, "--topic-odometry"),
+        (["map", "{good}", "--topic-odometry", "/wheels"], 3, "no such topic"),
+        (["map", "{good}", "-o", "m.txt"], 2, ".gpkg"),
+        (["map", "{good}", "-o", "a.gpkg", "--into", "b.gpkg"], 2, "one of them"),
+        (["map", "{good}", "--into", "none.gpkg"], 5, "no such map"),
+        (["map", "{good}", "--extrinsic", "gnss=1,2"], 2, "FRAME=X,Y,Z"),
+        (["map", "{empty}"], 3, "empty"),
+        (["map", "{good}", "--config", "none.yaml"], 2, "cannot be read"),
+        (["export", "none.gpkg", "x.csv"], 5, "no such map"),
+        (["simulate", "x.bag", "--design", "jungle"], 2, "known are"),
+        (["map"], 2, "Missing argument"),
+    ],
+)
+def test_bad_input(tmp_path: Path, words: list[str], code: int, says: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = {
+        "{good}": drive(tmp_path / "good.bag", seconds=5),
+        "{no_motion}": drive(tmp_path / "still.bag", odometry=False, seconds=5),
+        "{empty}": tmp_path / "empty.bag",
+    }
+    names["{empty}"].write_bytes(b"")
+    out = call(*[names.get(w, w) for w in words])
+    assert out.exit_code == code, out.output
+    assert says in out.output
+    assert "Traceback" not in out.output
+    assert not list(tmp_path.glob("*.gpkg"))
+
+
+def test_inspect(tmp_path: Path) -> None:
+    out = call("inspect", drive(tmp_path / "a.bag", seconds=5))
+    assert out.exit_code == 0
+    assert "/odom" in out.output
+    assert "nav_msgs/msg/Odometry" in out.output
+
+
+def test_committed_configuration_is_the_default() -> None:
+    text = (Path(__file__).resolve().parents[1] / "configs" / "default.yaml").read_text()
+    assert text == dump(Config()), "run: topograph config > configs/default.yaml"
+
+
+def test_configuration_round_trip_and_refusals(tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text(dump(Config()))
+    assert load(path) == Config()
+    with pytest.raises(UsageError, match=r"trees\.gat"):
+        from_dict({"trees": {"gat": 3}})
+    with pytest.raises(UsageError, match="forest"):
+        from_dict({"forest": {}})
+    path.write_text("trees: {gate: many}")
+    with pytest.raises(UsageError, match="gate"):
+        load(path)
+    path.write_text("a: &x 1\nb: *x\n")
+    with pytest.raises(UsageError, match="alias"):
+        load(path)
+    path.write_text("trees: {gate: 1}\ntrees: {gate: 2}\n")
+    with pytest.raises(UsageError, match="twice"):
+        load(path)
+
+
+def test_detect_writes_the_csv(tmp_path: Path, lidar_run: tuple[Path, Truth]) -> None:
+    path, _ = lidar_run
+    out = call("detect", path, "--csv", tmp_path / "t.csv", "--picture", tmp_path / "p.png", "--truth",
+               path.with_name("lidar.truth"), "-q")  # fmt: skip
+    assert out.exit_code == 0, out.output
+    head, *rows = (tmp_path / "t.csv").read_text().splitlines()
+    assert head == "stamp,x,y,z,height,diameter,score"
+    assert len(rows) > 100
+    assert (tmp_path / "p.png").stat().st_size > 10_000

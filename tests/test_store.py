@@ -1,0 +1,169 @@
+"""A map comes back as it was written, opens as a GeoPackage, and survives kills and damage."""
+
+import os
+import signal
+import sqlite3
+import struct
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from topograph import store
+from topograph.errors import MapError
+from topograph.geometry import Datum, exp
+from topograph.topomap import TopoMap, TopomapConfig, Viewpoint, neighbours
+
+
+def make(n: int, seed: int = 0, datum: Datum | None = Datum(40.1, -8.2, 90.0)) -> TopoMap:
+    rng = np.random.default_rng(seed)
+    p = rng.uniform(-50, 50, (n, 3))
+    A = rng.normal(size=(n, 3, 3))
+    cov = 1e-4 * (A @ np.swapaxes(A, 1, 2))
+    cov[:, 2, :2] = cov[:, :2, 2] = 0.0
+    axis = rng.normal(size=(n, 3)) * 0.1 + [0, 0, 1]
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    edges = neighbours(p[:, :2], TopomapConfig())
+    views = tuple(Viewpoint(i, axis[i], rng.uniform(-1, 1, (30, 3)).astype(np.float32)) for i in range(n))
+    poses = exp(rng.normal(size=(5, 6)))
+    diameter = rng.uniform(0.1, 0.5, n)
+    branch = np.where(rng.random(n) < 0.5, np.nan, 1.2)
+    return TopoMap(
+        datum, np.arange(1, n + 1), p, cov, axis, diameter, branch, rng.integers(1, 99, n), rng.normal(size=n),
+        rng.integers(-1, 3, n), edges, np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1), views,
+        np.arange(5) + 10**18, poses, 1e-4 * np.eye(3), {"config": "a: 1"},
+    )  # fmt: skip
+
+
+@settings(max_examples=15, deadline=None)
+@given(n=st.integers(0, 40), seed=st.integers(0, 9), local=st.booleans())
+def test_round_trip(tmp_path_factory: pytest.TempPathFactory, n: int, seed: int, local: bool) -> None:
+    path = tmp_path_factory.mktemp("map") / "m.gpkg"
+    m = make(n, seed, None if local else Datum(40.1, -8.2, 90.0))
+    store.save(m, path)
+    got = store.load(path)
+    assert got.datum == m.datum
+    for name in (
+        "ids",
+        "p",
+        "cov",
+        "axis",
+        "diameter",
+        "first_branch",
+        "sightings",
+        "score",
+        "row",
+        "edges",
+        "stamps_ns",
+    ):
+        np.testing.assert_allclose(getattr(got, name), getattr(m, name), atol=1e-12, err_msg=name)
+    np.testing.assert_allclose(got.map_T_robot, m.map_T_robot, atol=1e-9)
+    assert got.meta == m.meta
+    for a, b in zip(got.viewpoints, m.viewpoints, strict=True):
+        np.testing.assert_allclose(a.cloud, b.cloud, atol=0.00051)
+        assert a.tree == b.tree
+
+
+def test_it_is_a_geopackage(tmp_path: Path) -> None:
+    m = make(12)
+    store.save(m, tmp_path / "m.gpkg")
+    c = sqlite3.connect(tmp_path / "m.gpkg")
+    assert c.execute("PRAGMA application_id").fetchone()[0] == 0x47504B47
+    assert c.execute("PRAGMA integrity_check").fetchone()[0] == "ok"
+    assert {r[0] for r in c.execute("SELECT table_name FROM gpkg_contents WHERE data_type='features'")} == {
+        "trees",
+        "edges",
+        "path",
+    }
+    blob = c.execute("SELECT geom FROM trees WHERE id=1").fetchone()[0]
+    assert blob[:2] == b"GP"
+    assert struct.unpack("<i", blob[4:8])[0] == 4326
+    lon, lat, h = struct.unpack("<3d", blob[13:37])
+    np.testing.assert_allclose([lat, lon, h], m.geodetic()[0], atol=1e-9)
+    columns = {r[1] for r in c.execute("PRAGMA table_info(trees)")}
+    assert {"id", "geom", "x", "y", "z", "cov_xx", "cov_xy", "cov_yy", "axis_x", "axis_y", "axis_z", "diameter",
+            "sightings", "score", "row"} <= columns  # fmt: skip
+    c.close()
+
+
+def test_clouds_near_reads_only_those(tmp_path: Path) -> None:
+    m = make(30)
+    store.save(m, tmp_path / "m.gpkg")
+    found = store.clouds_near(tmp_path / "m.gpkg", m.p[3, :2], 20.0)
+    near = {int(i) for i in m.ids[np.linalg.norm(m.p[:, :2] - m.p[3, :2], axis=1) <= 20.0]}
+    assert {t for t, _, _ in found} == near
+
+
+def test_damage_and_versions(tmp_path: Path) -> None:
+    path = tmp_path / "m.gpkg"
+    store.save(make(3), path)
+    c = sqlite3.connect(path)
+    with c:
+        c.execute("UPDATE viewpoints SET cloud = zeroblob(length(cloud)) WHERE id=1")
+    c.close()
+    with pytest.raises(MapError, match="damaged"):
+        store.load(path)
+    store.load(path, clouds=False)
+    c = sqlite3.connect(path)
+    with c:
+        c.execute("UPDATE meta SET value='99' WHERE key='schema_version'")
+    c.close()
+    with pytest.raises(MapError, match="newer"):
+        store.load(path)
+    path.write_bytes(b"not a map at all" * 100)
+    with pytest.raises(MapError):
+        store.load(path)
+    with pytest.raises(MapError, match="no such map"):
+        store.load(tmp_path / "none.gpkg")
+
+
+def test_a_killed_write_leaves_the_old_map(tmp_path: Path) -> None:
+    path = tmp_path / "m.gpkg"
+    old = make(5, seed=1)
+    store.save(old, path)
+    code = (
+        "import sys; sys.path.insert(0, 'tests')\n"
+        "from pathlib import Path\nfrom test_store import make\nfrom topograph import store\n"
+        f"m = make(800, seed=2)\nprint('go', flush=True)\nwhile True: store.save(m, Path({str(path)!r}))\n"
+    )
+    root = Path(__file__).resolve().parents[1]
+    for k in range(4):
+        p = subprocess.Popen([sys.executable, "-c", code], cwd=root, stdout=subprocess.PIPE)
+        assert p.stdout is not None
+        p.stdout.readline()
+        time.sleep(0.03 + 0.05 * k)
+        os.kill(p.pid, signal.SIGKILL)
+        p.wait()
+        p.stdout.close()
+        assert len(store.load(path)) in (5, 800)
+
+
+def test_edges_do_not_depend_on_scale() -> None:
+    rng = np.random.default_rng(3)
+    xy = rng.uniform(0, 50, (60, 2))
+    a, b = neighbours(xy, TopomapConfig()), neighbours(100 * xy, TopomapConfig())
+    np.testing.assert_array_equal(a, b)
+    d = np.linalg.norm(xy[:, None] - xy[None], axis=2) + 1e9 * np.eye(60)
+    nearest = {(min(i, j), max(i, j)) for i, j in enumerate(d.argmin(axis=1).tolist())}
+    assert nearest <= {(int(i), int(j)) for i, j in a}  # the nearest neighbour is always a neighbour
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 5])
+def test_edges_of_few_or_lined_up_trees(n: int) -> None:
+    xy = np.stack([np.arange(n, dtype=float), np.zeros(n)], axis=1)
+    edges = neighbours(xy, TopomapConfig())
+    if n <= 3:
+        assert len(edges) <= n * (n - 1) // 2
+    assert {(k, k + 1) for k in range(n - 1)} <= {(int(a), int(b)) for a, b in edges}
+
+
+def test_radius_rule() -> None:
+    xy = np.array([[0.0, 0.0], [3.0, 0.0], [10.0, 0.0]])
+    config = replace(TopomapConfig(), edges="radius", radius=5.0)
+    np.testing.assert_array_equal(neighbours(xy, config), [[0, 1]])

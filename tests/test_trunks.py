@@ -1,0 +1,138 @@
+"""The trunk front end on made-up and simulated sweeps: right places, no crash on odd clouds."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from topograph.bags import Recording, Scan
+from topograph.config import Config
+from topograph.evaluate import Truth, trunk_metrics
+from topograph.geometry import exp
+from topograph.pipeline import read_run
+from topograph.trunks import TrunksConfig
+from topograph.trunks.detector import Detector, candidates
+from topograph.trunks.organise import rings_of
+
+MOUNT = np.eye(4)
+MOUNT[2, 3] = 0.8
+
+
+def cylinder_scene(rings: int, x: float, y: float, diameter: float, columns: int = 1800, slope: float = 0.0) -> Scan:
+    """A sweep over a ramp with one upright cylinder, without noise, from a sensor 0.8 m up."""
+    elevation = np.radians(np.linspace(-15, 15, rings))
+    azimuth = np.linspace(np.pi, -np.pi, columns, endpoint=False)
+    el, az = np.meshgrid(elevation, azimuth)
+    d = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az), np.sin(el)], axis=-1).reshape(-1, 3)
+    normal = np.array([-np.tan(slope), 0.0, 1.0])
+    with np.errstate(divide="ignore"):
+        ground = -0.8 / (d @ normal)
+    ground[(ground <= 0) | (ground > 60)] = np.inf
+    a = d[:, 0] ** 2 + d[:, 1] ** 2
+    b = -(d[:, 0] * x + d[:, 1] * y)
+    disc = b * b - a * (x * x + y * y - 0.25 * diameter**2)
+    with np.errstate(invalid="ignore"):
+        trunk = np.where(disc > 0, (-b - np.sqrt(disc)) / a, np.inf)
+    trunk[d[:, 2] * trunk > 3.0] = np.inf
+    t = np.minimum(ground, trunk)
+    keep = np.isfinite(t)
+    ring = np.tile(np.arange(rings), columns)[keep]
+    return Scan(10**18, "lidar", (d * t[:, None])[keep].astype(np.float32), ring.astype(np.int32), None, None)
+
+
+@pytest.mark.parametrize("rings", [16, 32, 64, 128])
+@pytest.mark.parametrize("place", [(4.0, 1.0, 0.25), (-7.0, 5.0, 0.35), (0.0, -12.0, 0.3)])
+def test_a_cylinder_is_found_where_it_stands(rings: int, place: tuple[float, float, float]) -> None:
+    x, y, diameter = place
+    c = candidates(cylinder_scene(rings, x, y, diameter), MOUNT, np.zeros(6), TrunksConfig())
+    error = np.hypot(c.fits[:, 0] - x, c.fits[:, 1] - y)
+    best = c.fits[np.argmin(error)]
+    assert error.min() < 0.03
+    assert best[6] == pytest.approx(diameter, abs=0.06)
+    assert abs(best[5]) > 0.99
+
+
+@pytest.mark.parametrize("slope", [-0.2, 0.1, 0.2])
+def test_heights_follow_the_slope(slope: float) -> None:
+    c = candidates(cylinder_scene(32, 6.0, 2.0, 0.3, slope=slope), MOUNT, np.zeros(6), TrunksConfig())
+    best = c.fits[np.argmin(np.hypot(c.fits[:, 0] - 6.0, c.fits[:, 1] - 2.0))]
+    assert best[2] == pytest.approx(6.0 * np.tan(slope) + best[7], abs=0.1)
+
+
+def test_missing_rings_are_found_from_elevation() -> None:
+    scan = cylinder_scene(16, 5.0, 0.0, 0.3)
+    ring, n = rings_of(replace(scan, ring=None))
+    assert n <= 16
+    assert scan.ring is not None
+    used = np.unique(scan.ring)
+    np.testing.assert_array_equal(np.searchsorted(used, scan.ring), ring)
+
+
+def test_order_of_points_does_not_matter() -> None:
+    scan = cylinder_scene(16, 5.0, 2.0, 0.3)
+    order = np.random.default_rng(0).permutation(len(scan.xyz))
+    assert scan.ring is not None
+    shuffled = replace(scan, xyz=scan.xyz[order], ring=scan.ring[order])
+    a, b = (candidates(s, MOUNT, np.zeros(6), TrunksConfig()).fits for s in (scan, shuffled))
+    for fits in (a, b):
+        assert np.hypot(fits[:, 0] - 5.0, fits[:, 1] - 2.0).min() < 0.03
+
+
+def test_deskew_undoes_motion() -> None:
+    """A sweep taken while driving and turning gives the trunk where it is at the stamp."""
+    scan = cylinder_scene(32, 5.0, 3.0, 0.3)
+    twist = np.array([1.5, 0.0, 0.0, 0.0, 0.0, 0.8])
+    offset = np.linspace(-0.1, 0.0, len(scan.xyz)).astype(np.float32)
+    moved = np.empty_like(scan.xyz)
+    for k in range(0, len(offset), 50):  # where a point is seen from depends on when
+        stamp_T_then = exp(np.concatenate([twist[3:], twist[:3]]) * float(offset[k : k + 50].mean()))
+        base = scan.xyz[k : k + 50] @ MOUNT[:3, :3].T + MOUNT[:3, 3]
+        moved[k : k + 50] = (base - stamp_T_then[:3, 3]) @ stamp_T_then[:3, :3] - MOUNT[:3, 3]
+    skewed = replace(scan, xyz=moved, offset=offset)
+    still = candidates(skewed, MOUNT, np.zeros(6), TrunksConfig()).fits
+    right = candidates(skewed, MOUNT, twist, TrunksConfig()).fits
+    assert np.hypot(right[:, 0] - 5.0, right[:, 1] - 3.0).min() < 0.03
+    assert np.hypot(still[:, 0] - 5.0, still[:, 1] - 3.0).min() > 0.05
+
+
+@pytest.mark.parametrize(
+    "xyz",
+    [
+        np.zeros((0, 3)),
+        np.full((500, 3), np.nan),
+        np.zeros((500, 3)),
+        np.full((500, 3), np.inf),
+        np.random.default_rng(0).uniform(-20, 20, (3000, 3)),
+        np.column_stack([np.random.default_rng(1).uniform(-20, 20, (5000, 2)), np.full(5000, -0.8)]),
+    ],
+    ids=["empty", "nan", "zero", "infinite", "noise", "plane"],
+)
+def test_odd_clouds_do_no_harm(xyz: np.ndarray) -> None:
+    detector = Detector(MOUNT, TrunksConfig())
+    out = detector(Scan(1, "lidar", xyz.astype(np.float32), None, None, None), np.zeros(6))
+    assert np.isfinite(out.p).all()
+    assert len(out) <= 3
+
+
+def test_simulated_sweeps(lidar_run: tuple[Path, Truth]) -> None:
+    """Unseen seed and a small orchard: most trunks within 10 m, few false ones, centimetres off."""
+    path, truth = lidar_run
+    run = read_run([path], Config())
+    _, table = trunk_metrics(truth, np.array([t.stamp_ns for t in run.trunks]), [t.p for t in run.trunks])
+    near = table[0]
+    assert near["visible"] > 100
+    assert near["precision"] > 0.8
+    assert near["recall"] > 0.8
+    assert abs(near["radial_bias"]) < 0.02
+    assert near["radial_sd"] < 0.05
+
+
+def test_detection_is_a_pure_function(lidar_run: tuple[Path, Truth]) -> None:
+    with Recording([lidar_run[0]]) as r:
+        scans = [m for n, (_, m) in enumerate(r.messages(["points"])) if n in (5, 50)]
+        mount = r.frames.get("velodyne")
+    a, b = (Detector(mount, TrunksConfig()) for _ in range(2))
+    for scan in scans:
+        b(scans[0], np.zeros(6))
+        np.testing.assert_array_equal(a(scan, np.zeros(6)).p, b(scan, np.zeros(6)).p)

@@ -169,8 +169,10 @@ def test_topics() -> None:
 def test_unknown_frame_says_what_to_type(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "a.bag") as w:
         w.points("/p", T0, T0, "velodyne", points(VELODYNE))
-    with Recording([tmp_path / "a.bag"]) as r, pytest.raises(FrameError, match="--extrinsic velodyne="):
-        r.frames.get("velodyne")
+    with Recording([tmp_path / "a.bag"]) as r:
+        frames = r.frames
+    with pytest.raises(FrameError, match="--extrinsic velodyne="):
+        frames.get("velodyne")
     config = BagsConfig(extrinsics={"velodyne": (1, 2, 3, 0, 0, np.pi / 2)})
     with Recording([tmp_path / "a.bag"], config) as r:
         np.testing.assert_allclose(r.frames.get("velodyne")[:3, 3], [1, 2, 3])
@@ -183,7 +185,7 @@ def test_truncated_bags_are_named(tmp_path: Path, cut: int) -> None:
             w.imu("/imu", T0 + k, T0 + k, "imu", np.zeros(3), np.ones(3))
     data = (tmp_path / "a.bag").read_bytes()
     (tmp_path / "cut.bag").write_bytes(data[:cut])
-    with pytest.raises(InputError, match="cut.bag"), Recording([tmp_path / "cut.bag"]) as r:
+    with pytest.raises(InputError, match=r"cut\.bag"), Recording([tmp_path / "cut.bag"]) as r:
         list(r.messages())
 
 
@@ -196,9 +198,8 @@ def test_no_file_and_no_recording(tmp_path: Path) -> None:
 
 
 def test_a_writer_that_fails_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError, match="stop"), BagWriter(tmp_path / "a.bag") as w:
-        w.imu("/imu", T0, T0, "imu", np.zeros(3), np.ones(3))
-        raise RuntimeError("stop")
+    with pytest.raises(ValueError, match="could not convert"), BagWriter(tmp_path / "a.bag") as w:
+        w.imu("/imu", T0, T0, "imu", ["no number", 0.0, 0.0], np.ones(3))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -210,4 +211,5 @@ def test_real_bags(shared: Path) -> None:
         scan = next(m for _, m in r.messages(["points"]))
         assert isinstance(scan, Scan)
         assert scan.offset is not None
-        assert -0.2 < scan.offset.min() < 0 and scan.ring is not None
+        assert -0.2 < scan.offset.min() < 0
+        assert scan.ring is not None

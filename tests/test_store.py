@@ -20,8 +20,10 @@ from topograph.errors import MapError
 from topograph.geometry import Datum, exp
 from topograph.topomap import TopoMap, TopomapConfig, Viewpoint, neighbours
 
+HERE = Datum(40.1, -8.2, 90.0)
 
-def make(n: int, seed: int = 0, datum: Datum | None = Datum(40.1, -8.2, 90.0)) -> TopoMap:
+
+def make(n: int, seed: int = 0, datum: Datum | None = HERE) -> TopoMap:
     rng = np.random.default_rng(seed)
     p = rng.uniform(-50, 50, (n, 3))
     A = rng.normal(size=(n, 3, 3))
@@ -45,7 +47,7 @@ def make(n: int, seed: int = 0, datum: Datum | None = Datum(40.1, -8.2, 90.0)) -
 @given(n=st.integers(0, 40), seed=st.integers(0, 9), local=st.booleans())
 def test_round_trip(tmp_path_factory: pytest.TempPathFactory, n: int, seed: int, local: bool) -> None:
     path = tmp_path_factory.mktemp("map") / "m.gpkg"
-    m = make(n, seed, None if local else Datum(40.1, -8.2, 90.0))
+    m = make(n, seed, None if local else HERE)
     store.save(m, path)
     got = store.load(path)
     assert got.datum == m.datum

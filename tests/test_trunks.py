@@ -33,12 +33,12 @@ def cylinder_scene(rings: int, x: float, y: float, diameter: float, columns: int
     b = -(d[:, 0] * x + d[:, 1] * y)
     disc = b * b - a * (x * x + y * y - 0.25 * diameter**2)
     with np.errstate(invalid="ignore"):
-        trunk = np.where(disc > 0, (-b - np.sqrt(disc)) / a, np.inf)
-    trunk[d[:, 2] * trunk > 3.0] = np.inf
+        trunk = np.where(disc > 0, (-b - np.sqrt(disc)) / a, 1e9)
+    trunk[(d[:, 2] * trunk > 3.0) | (trunk > 60) | (trunk <= 0)] = np.inf
     t = np.minimum(ground, trunk)
     keep = np.isfinite(t)
     ring = np.tile(np.arange(rings), columns)[keep]
-    return Scan(10**18, "lidar", (d * t[:, None])[keep].astype(np.float32), ring.astype(np.int32), None, None)
+    return Scan(10**18, "lidar", (d[keep] * t[keep, None]).astype(np.float32), ring.astype(np.int32), None, None)
 
 
 @pytest.mark.parametrize("rings", [16, 32, 64, 128])

@@ -33,11 +33,11 @@ class EstimateConfig:
     keyframe_turn: float = 0.2
     keyframe_seconds: float = 5.0
     fix_floor: tuple[float, float] = (0.01, 0.02)
-    fix_correlation_s: float = 30.0
+    fix_correlation_s: float = 6.0
     heading_floor: float = 0.005
     huber: float = 1.345
     tukey: float = 4.685
-    tree_floor: float = 0.008
+    tree_floor: float = 0.003
     use_imu: bool = True
     learn_scale: bool = True
     iterations: int = 40

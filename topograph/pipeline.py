@@ -207,10 +207,11 @@ def solve_run(
     motion = dead_reckon(run.streams, inertial, run.child_T_robot, config.motion)
     if motion is None:
         raise InsufficientDataError(
-            "no wheel odometry and no IMU: the motion between scans is unknown; name them with --topic-odometry or --topic-imu"
+            "no wheel odometry and fewer than ten usable fixes: the distance between scans is unknown; "
+            "name them with --topic-odometry or --topic-fix"
         )
     if not motion.wheels:
-        notes.append("no wheel odometry: the distance between poses rests on GNSS, IMU and trunks")
+        notes.append("no wheel odometry: the motion between poses rests on GNSS fixes, IMU and trunks")
     if not motion.gyro:
         notes.append("no IMU: turns rest on the wheels, the slope on GNSS and trunks")
     detections = Detections.of(run.trunks)

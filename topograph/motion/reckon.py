@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from scipy.ndimage import gaussian_filter1d
 
-from topograph.geometry import Array, Stamps, exp, from_quaternion, interpolate, inverse, log, yaw_of
+from topograph.geometry import Array, Datum, Stamps, exp, from_quaternion, interpolate, inverse, log, planar, yaw_of
 from topograph.motion.inertial import GRAVITY, Inertial
 from topograph.motion.streams import Streams
 
@@ -88,20 +89,13 @@ class Motion:
 def dead_reckon(
     streams: Streams, inertial: Inertial | None, child_T_robot: Array, config: MotionConfig
 ) -> Motion | None:
-    """Motion of the base from what there is: wheels and IMU, wheels alone, IMU alone; None with neither.
+    """Motion of the base from what there is: wheels and IMU, wheels alone, or GNSS (with the gyro's turns, if any).
 
-    With the IMU alone the turn is known and the distance is not: the poses stay in place.
+    None when nothing tells the distance: neither wheels nor at least ten fixes.
     """
     n = len(streams.odometry_ns)
-    if n < 2 and inertial is None:
-        return None
     if n < 2:
-        assert inertial is not None
-        R = _attitude(inertial, None, config)
-        T = np.tile(np.eye(4), (len(R), 1, 1))
-        T[:, :3, :3] = R
-        turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.unwrap(yaw_of(T)))))])
-        return Motion(inertial.stamps_ns, T, np.zeros(len(T)), turned, True, False)
+        return _from_fixes(streams, inertial, config)
     odom_T_robot = streams.odom_T_child @ child_T_robot
     step = inverse(odom_T_robot[:-1]) @ odom_T_robot[1:]
     step = _without_jumps(step, np.diff(streams.odometry_ns) * 1e-9)
@@ -129,6 +123,31 @@ def dead_reckon(
     T[1:, :3, 3] = np.cumsum(moves, axis=0)
     turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.unwrap(yaw_of(T)))))])
     return Motion(streams.odometry_ns, T, distance, turned, True, True)
+
+
+def _from_fixes(streams: Streams, inertial: Inertial | None, config: MotionConfig) -> Motion | None:
+    """Without wheels: the fixes, smoothed, say where the robot was; the gyro, or the course, which way it looked."""
+    if len(streams.fix_ns) < 10:
+        return None
+    lat, lon, h = (float(v) for v in np.median(streams.lat_lon_h, axis=0))
+    enu = gaussian_filter1d(Datum(lat, lon, h).to_enu(streams.lat_lon_h), 1.5, axis=0, mode="nearest")
+    stamps = streams.fix_ns
+    step = np.linalg.norm(np.diff(enu[:, :2], axis=0), axis=1)
+    distance = np.concatenate([[0.0], np.cumsum(step)])
+    ahead = np.gradient(enu[:, :2], axis=0)
+    moving = np.linalg.norm(ahead, axis=1) > 0.5 * np.median(step)
+    course = np.unwrap(np.interp(distance, distance[moving], np.unwrap(np.arctan2(ahead[moving, 1], ahead[moving, 0]))))
+    T = planar(enu[:, 0], enu[:, 1], course)
+    T[:, 2, 3] = enu[:, 2]
+    gyro = inertial is not None and _overlap(inertial.stamps_ns, stamps) > 0.8
+    if gyro and inertial is not None:
+        pose = np.tile(np.eye(4), (len(inertial.stamps_ns), 1, 1))
+        pose[:, :3, :3] = _attitude(inertial, None, config)
+        R = interpolate(inertial.stamps_ns, pose, stamps)
+        turn = float(np.angle(np.mean(np.exp(1j * (course - yaw_of(R))[moving]))))
+        T[:, :3, :3] = (planar(0.0, 0.0, turn) @ R)[:, :3, :3]
+    turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.unwrap(yaw_of(T)))))])
+    return Motion(stamps, T, distance, turned, gyro, False)
 
 
 def _overlap(a: Stamps, b: Stamps) -> float:

@@ -59,7 +59,9 @@ def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False, pati
         problem = replace(problem, sightings=_nearest(problem.sightings, 25))
     values = _values(problem, poses, trees, inert)
     first = _Pass(huber, huber, 0.05 if quick else 0.0)
-    steps, tolerance = (10, 1e-3) if quick and not patient else (3 * config.iterations, 1e-5 if quick else 1e-6)
+    steps, tolerance = (3 * config.iterations, 1e-6)
+    if quick:
+        steps, tolerance = (config.iterations, 1e-5) if patient else (10, 1e-3)
     values = levenberg_marquardt(_graph(problem, first, config, inert), values, steps, tolerance)
     if quick:
         return _estimate(problem, config, values, first, None, time.perf_counter() - began)

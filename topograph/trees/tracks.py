@@ -41,7 +41,7 @@ class TreesConfig:
     margin: float = 7.0
     merge: float = 0.7
     min_sightings: int = 6
-    min_score: float = 1.15
+    min_score: float = 1.35
     min_ratio: float = 0.15
     min_share: float = 0.03
 

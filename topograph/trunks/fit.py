@@ -19,11 +19,13 @@ from topograph.trunks.runs import (
     RING,
     WIDTH,
     count_around,
+    sides_covered,
 )
 
 FEATURES = (
     "range", "rings", "points", "diameter", "width_spread", "rough", "line_rms", "lean", "free", "lowest", "highest",
     "canopy", "undergrowth", "top_visible", "fill", "taper", "depth_slope", "ring_gap", "overhead", "close_by",
+    "covered_near", "covered",
 )  # fmt: skip
 OUT_SIZE = 16
 """x, y, z, axis (3), diameter, height, radial and tangential sigma, lean sigma, points, rings, range, bearing x, y."""
@@ -58,7 +60,7 @@ def fit_chains(
     """
     k = runs.shape[0]
     out = np.empty((k, OUT_SIZE))
-    feature = np.empty((k, 20))
+    feature = np.empty((k, 22))
     name = np.empty(k, np.int64)
     n_out = 0
     members = np.empty(k, np.int64)
@@ -200,6 +202,8 @@ def fit_chains(
         f[17] = (runs[last, RING] - runs[first, RING] + 1.0) / n
         f[18] = np.log(1.0 + overhead)
         f[19] = np.log(1.0 + max(close_by - points, 0.0))
+        f[20] = sides_covered(above, px + lx, py + ly, 0.3, 0.9)
+        f[21] = sides_covered(above, px + lx, py + ly, 0.9, 1.6)
         name[n_out] = c
         n_out += 1
     return out[:n_out], feature[:n_out], name[:n_out]

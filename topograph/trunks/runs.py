@@ -55,6 +55,23 @@ def count_around(cells, x, y, inner, outer):
 
 
 @njit(cache=True)
+def sides_covered(cells, x, y, inner, outer):
+    """Octants around a position that hold points between `inner` and `outer` m: a canopy is all around its trunk."""
+    i, j = int(4.0 * (x + HALF)), int(4.0 * (y + HALF))
+    k = int(4.0 * outer) + 1
+    covered = np.zeros(8, np.int64)
+    for a in range(max(i - k, 0), min(i + k + 1, CELLS)):
+        for b in range(max(j - k, 0), min(j + k + 1, CELLS)):
+            if cells[a, b] == 0:
+                continue
+            dx, dy = 0.25 * (a + 0.5) - HALF - x, 0.25 * (b + 0.5) - HALF - y
+            d2 = dx * dx + dy * dy
+            if inner * inner < d2 < outer * outer:
+                covered[int((np.arctan2(dy, dx) + np.pi) / (2.0 * np.pi) * 7.999)] = 1
+    return covered.sum()
+
+
+@njit(cache=True)
 def find_runs(p, r, a, h, starts, step, low, high, widest):
     """Runs (K, RUN_SIZE) and the run (M,) of each point or -1.
 

@@ -124,7 +124,7 @@ def test_bad_input(tmp_path: Path, words: list[str], code: int, says: str, monke
     monkeypatch.chdir(tmp_path)
     names = {
         "{good}": drive(tmp_path / "good.bag", seconds=5),
-        "{no_motion}": drive(tmp_path / "still.bag", odometry=False, seconds=5),
+        "{no_motion}": drive(tmp_path / "still.bag", "bad", odometry=False, seconds=5),
         "{empty}": tmp_path / "empty.bag",
     }
     names["{empty}"].write_bytes(b"")

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from topograph.config import Config
-from topograph.evaluate import map_metrics, path_metrics
+from topograph.evaluate import map_metrics, truth_metrics
 from topograph.evaluate.metrics import tree_errors
 from topograph.pipeline import baseline, read_run, solve_run, topo_map
 from topograph.simulate import DESIGNS, DriveConfig, SensorConfig, record
@@ -43,10 +43,8 @@ def one(bag: Path, seed: int, design: str, sensor: SensorConfig, run: int) -> di
     config = Config()
     solved = solve_run(read_run([bag], config), config)
     topo = topo_map(solved, config, {})
-    e, datum = solved.estimate, solved.problem.datum
-    out = {m.name: m.value for m in map_metrics(topo, truth)}
-    out |= {m.name: m.value for m in path_metrics(e.stamps_ns, e.map_T_robot, datum, truth.stamps_ns,
-                                                  truth.world_T_robot, truth.datum)}  # fmt: skip
+    e = solved.estimate
+    out = {m.name: m.value for m in truth_metrics(topo, e.stamps_ns, e.map_T_robot, truth)}
     theirs = {m.name: m.value for m in map_metrics(baseline(solved, config)[1], truth)}
     out["thesis: tree error mean"] = theirs["tree error mean"]
     out["thesis / graph"] = theirs["tree error mean"] / out["tree error mean"]

@@ -225,7 +225,7 @@ def _save_results(
 
     from topograph import pipeline, report, store
     from topograph.config import dump
-    from topograph.evaluate import map_metrics, path_metrics, write_tum
+    from topograph.evaluate import truth_metrics, write_tum
     from topograph.evaluate.metrics import doubles, tree_errors
     from topograph.report.record import write_text
 
@@ -241,19 +241,7 @@ def _save_results(
     figures, true_trees = {}, None
     if true is not None:
         e = solved.estimate
-        datum = solved.problem.datum
-        metrics = (
-            map_metrics(topo, true)
-            + path_metrics(
-                e.stamps_ns,
-                e.map_T_robot,
-                datum,
-                true.stamps_ns,
-                true.world_T_robot,
-                true.datum if datum is not None else None,
-            )
-            + metrics
-        )
+        metrics = truth_metrics(topo, e.stamps_ns, e.map_T_robot, true) + metrics
         true_trees = true.trees_in(topo.datum) if topo.datum is not None else None
         _, _, error = tree_errors(topo, true)
         if len(error):
@@ -305,7 +293,7 @@ def compare(
 ) -> None:
     """Map BAGS by factor graph and by the thesis's averaging, side by side on the same detections."""
     from topograph import pipeline, report
-    from topograph.evaluate import map_metrics, path_metrics
+    from topograph.evaluate import truth_metrics
     from topograph.evaluate.metrics import doubles, tree_errors
     from topograph.report.page import show
 
@@ -322,24 +310,14 @@ def compare(
     for name, topo, e in (("graph", ours, solved.estimate), ("thesis", theirs, estimate)):
         metrics = [doubles(topo)]
         if true is not None:
-            datum = topo.datum
-            metrics = map_metrics(topo, true) + path_metrics(
-                e.stamps_ns,
-                e.map_T_robot,
-                datum,
-                true.stamps_ns,
-                true.world_T_robot,
-                true.datum if datum is not None else None,
-            )
+            metrics = truth_metrics(topo, e.stamps_ns, e.map_T_robot, true)
             errors[name] = np.linalg.norm(tree_errors(topo, true)[2][:, :2], axis=1)
         rows[name] = [*metrics, replace(metrics[0], name="seconds", value=e.seconds, unit="s")]
-    names = [m.name for m in rows["graph"]]
     click.echo(f"{'':<34} {'graph':>12} {'thesis':>12}")
     theirs_by_name = {m.name: m for m in rows["thesis"]}
     for m in rows["graph"]:
         other = theirs_by_name.get(m.name)
         click.echo(f"{m.name:<34} {show(m):>12} {show(other) if other else '–':>12}")
-    del names
     if errors:
         (folder / "comparison.png").write_bytes(report.comparison_figure(errors))
     flat = [replace(m, name=f"{k}: {m.name}") for k, ms in rows.items() for m in ms]

@@ -128,6 +128,13 @@ def path_metrics(
     ]
 
 
+def truth_metrics(topo: TopoMap, stamps_ns: Stamps, map_T_robot: Array, truth: Truth) -> list[Metric]:
+    """All that the truth says of a map and of the path (K,), (K, 4, 4) that it was made with."""
+    true_datum = truth.datum if topo.datum is not None else None
+    path = path_metrics(stamps_ns, map_T_robot, topo.datum, truth.stamps_ns, truth.world_T_robot, true_datum)
+    return map_metrics(topo, truth) + path
+
+
 def fix_metrics(antenna: Array, fix: Array, sigma: Array) -> list[Metric]:
     """Horizontal distance of the path's antenna (H, 3) from fixes (H, 3) that were withheld; `sigma` (H,) as stated.
 

@@ -55,8 +55,8 @@ def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False, pati
     trees = _median_trees(problem, poses)
     huber = Kernel("huber", config.huber)
     inert = None if quick or not config.use_imu else inertia(problem)
-    if quick:
-        problem = replace(problem, sightings=_nearest(problem.sightings, 25))
+    most = config.quick_sightings if quick else config.most_sightings
+    problem = replace(problem, sightings=_nearest(problem.sightings, most))
     values = _values(problem, poses, trees, inert)
     first = _Pass(huber, huber, 0.05 if quick else 0.0)
     steps, tolerance = (3 * config.iterations, 1e-6)

@@ -25,6 +25,8 @@ class EstimateConfig:
         tree_floor: persistent error of a trunk's centre that no number of sightings removes, m.
         use_imu: IMU factors in the final solve.
         learn_scale: rescale trunk and GNSS noise by their residuals.
+        most_sightings, quick_sightings: of one keyframe that are used, the surest first: where a hundred trunks are in
+            view, the far ones add errors of their own kind and no information.
         iterations: most Levenberg-Marquardt steps of a pass.
         d_max: of the thesis's Algorithm 3, m.
     """
@@ -40,6 +42,8 @@ class EstimateConfig:
     tree_floor: float = 0.003
     use_imu: bool = True
     learn_scale: bool = True
+    most_sightings: int = 30
+    quick_sightings: int = 20
     iterations: int = 40
     d_max: float = 1.5
 

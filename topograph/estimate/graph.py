@@ -61,7 +61,7 @@ def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False, pati
     first = _Pass(huber, huber, 0.05 if quick else 0.0)
     steps, tolerance = (3 * config.iterations, 1e-6)
     if quick:
-        steps, tolerance = (config.iterations, 1e-5) if patient else (10, 1e-3)
+        steps, tolerance = (3 * config.iterations, 1e-5) if patient else (10, 1e-3)
     values = levenberg_marquardt(_graph(problem, first, config, inert), values, steps, tolerance)
     if quick:
         return _estimate(problem, config, values, first, None, time.perf_counter() - began)

@@ -43,7 +43,7 @@ class EstimateConfig:
     use_imu: bool = True
     learn_scale: bool = True
     most_sightings: int = 30
-    quick_sightings: int = 20
+    quick_sightings: int = 25
     iterations: int = 40
     d_max: float = 1.5
 

@@ -98,7 +98,7 @@ class LoopCloser:
         pairs, moved, move, centre = result
         seen_again = np.isin(self.tree, there_id[[j for _, j in pairs]]) & old
         # A small step the solver takes by itself.
-        self.link = (float(np.median(t.last[seen_again])), self.at, centre, move) if moved > 2.0 else None
+        self.link = (float(np.median(t.last[seen_again])), self.at, centre, move) if moved > 0.8 else None
         for i, j in pairs:
             self.tree[self.tree == here_id[i]] = there_id[j]
         self.anchored = self.at

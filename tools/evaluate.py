@@ -21,7 +21,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from topograph.config import Config
-from topograph.evaluate import map_metrics, truth_metrics
+from topograph.evaluate import Truth, map_metrics, truth_metrics
 from topograph.evaluate.metrics import tree_errors
 from topograph.pipeline import baseline, read_run, solve_run, topo_map
 from topograph.simulate import DESIGNS, DriveConfig, SensorConfig, record
@@ -35,8 +35,6 @@ def one(bag: Path, seed: int, design: str, sensor: SensorConfig, run: int) -> di
     orchard = replace(DESIGNS[design], lean=0.0, multi_stem=0.0) if sensor.detections else design
     truth_folder = bag.with_name(bag.stem + ".truth")
     if bag.exists():
-        from topograph.evaluate import Truth
-
         truth = Truth.load(truth_folder)
     else:
         truth = record(bag, seed, orchard, DriveConfig(run=run), sensor)

@@ -161,11 +161,10 @@ def _peak_mb() -> float:
     return peak / 1024 if sys.platform != "darwin" else peak / 1024**2
 
 
-def _truth(folder: Path | None, bags: Sequence[Path]) -> Any:
+def _truth(folder: Path | None) -> Any:
     """The truth that was named; none is looked for: an estimator must not find it by itself."""
     from topograph.evaluate import Truth
 
-    del bags
     return None if folder is None else Truth.load(folder)
 
 
@@ -196,7 +195,7 @@ def map_command(
     if output is not None and into is not None:
         raise UsageError("-o makes a new map, --into extends one: give one of them")
     config = _config(config_file, words)
-    true = _truth(truth, bags)
+    true = _truth(truth)
     old = None if into is None else store.load(into)
     folder = _results(results)
     target = into or output or folder / "map.gpkg"
@@ -257,7 +256,7 @@ def _save_results(
     seconds = {**solved.seconds, "map and report": time.perf_counter() - began}
     write_tum(folder / "path.tum", solved.estimate.stamps_ns, solved.estimate.map_T_robot)
     write_text(folder / "config.yaml", text)
-    notes = list(solved.run.notes) + ([pipeline.why_no_trees(solved)] if pipeline.why_no_trees(solved) else [])
+    notes = [*solved.run.notes, *filter(None, [pipeline.why_no_trees(solved)])]
     facts = {
         "from": ", ".join(p.name for p in bags),
         "recorded": f"{solved.run.duration_s:.0f} s",
@@ -298,7 +297,7 @@ def compare(
     from topograph.report.page import show
 
     config = _config(config_file, words)
-    true = _truth(truth, bags)
+    true = _truth(truth)
     folder = _results(results)
     with _progress(quiet) as progress:
         run = pipeline.read_run(bags, config, progress)
@@ -380,7 +379,7 @@ def detect(
     from topograph.report.record import write_text
 
     config = _config(config_file, words)
-    true = _truth(truth, bags)
+    true = _truth(truth)
     with _progress(quiet) as progress:
         run = pipeline.read_run(bags, config, progress)
     if run.scans == 0:

@@ -111,7 +111,7 @@ class Recording:
         wanted = {self.chosen[k]: k for k in kinds if k in self.chosen}
         newest: dict[str, int] = {}
         merged = heapq.merge(*(self._raw(i, set(wanted)) for i in range(len(self._readers))), key=lambda m: m[1])
-        for i, log_ns, connection, raw in merged:
+        for i, _, connection, raw in merged:
             kind = wanted[connection.topic]
             product = self._product(kind, self._readers[i], connection, raw)
             if product is None:
@@ -125,7 +125,6 @@ class Recording:
                 self.skipped[f"{kind}: stamp goes backwards"] += 1
                 continue
             newest[kind] = max(last, stamp)
-            del log_ns
             yield kind, product
 
     def _raw(self, i: int, names: set[str]) -> Iterator[tuple[int, int, Connection, Any]]:

@@ -125,7 +125,7 @@ def _orthonormal(poses: Array) -> Array:
 def _graph(problem: Problem, p: _Pass, config: EstimateConfig, inert: Inertia | None, *, trunks: bool = True) -> Any:
     g = gtsam.NonlinearFactorGraph()
     _add_motion(g, problem, inert)
-    _add_fixes(g, problem, p, config)
+    _add_fixes(g, problem, p)
     if problem.link is not None:
         sigma = [0.1, 0.1, 0.02, 0.2, 0.2, 0.5]
         g.add(factors.odometry(X + problem.link.a, X + problem.link.b, _orthonormal(problem.link.a_T_b), sigma))
@@ -201,14 +201,14 @@ def _add_motion(g: Any, problem: Problem, inert: Inertia | None) -> None:
         inert.add_to(g, X, V, B)
 
 
-def _add_fixes(g: Any, problem: Problem, p: _Pass, config: EstimateConfig) -> None:
+def _add_fixes(g: Any, problem: Problem, p: _Pass) -> None:
     """Each fix twice: its horizontal part and its height, each under a loss of its own.
 
     Heights fail by tens of metres while positions are sound (a receiver that has just started): one must not take
     the other with it.
     """
     f = problem.fixes
-    cov = _fix_cov(problem, p, config)
+    cov = _fix_cov(problem, p)
     free = 1e6
     flat, tall = cov.copy(), np.zeros_like(cov)
     flat[:, 2, :2] = flat[:, :2, 2] = 0.0
@@ -220,9 +220,8 @@ def _add_fixes(g: Any, problem: Problem, p: _Pass, config: EstimateConfig) -> No
             g.add(factors.fix(X + k, z, lever, c, p.fix))
 
 
-def _fix_cov(problem: Problem, p: _Pass, config: EstimateConfig) -> Array:
+def _fix_cov(problem: Problem, p: _Pass) -> Array:
     f = problem.fixes
-    del config
     return np.asarray(p.fix_scale**2 * f.cov + p.fix_floor**2 * np.eye(3))
 
 
@@ -335,7 +334,7 @@ def _other_residuals(problem: Problem, values: Any, p: _Pass, config: EstimateCo
     misfit = log(inverse(step) @ inverse(poses[:-1]) @ poses[1:]) / problem.step_sigma
     out = {"odometry": misfit[:, 3:5].ravel(), "turn": misfit[:, 2]}
     if len(problem.fixes.keyframe):
-        variance = np.diagonal(_fix_cov(problem, p, config), axis1=1, axis2=2)
+        variance = np.diagonal(_fix_cov(problem, p), axis1=1, axis2=2)
         out["fix"] = (_fix_residuals(problem, values) / np.sqrt(variance)).ravel()
     h = problem.headings
     if len(h.keyframe):

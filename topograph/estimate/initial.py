@@ -38,7 +38,7 @@ def initial_path(problem: Problem) -> Array:
     v = np.array(values)
     # Far-apart windows give shifts about different turns; compare them where the robot is.
     yaw_all = np.interp(distance, centres, np.unwrap(v[:, 2]))
-    here = np.stack([np.interp(distance, distance, odom[:, k, 3]) for k in range(2)], axis=1)
+    here = odom[:, :2, 3]
     placed = np.empty((len(centres), len(distance), 2))
     for n, (x, y, yaw, _) in enumerate(values):
         c, s = np.cos(yaw), np.sin(yaw)

@@ -158,5 +158,6 @@ def scan_figure(scan: Scan, base_T_lidar: Array, trunks: Trunks, true: Array | N
 
 def cloud_points(topo: TopoMap, rows: Sequence[int]) -> NDArray[np.float32]:
     """Points (M, 3) of all viewpoint clouds of some nodes, in the map frame."""
-    parts = [v.cloud + topo.p[v.tree].astype(np.float32) for v in topo.viewpoints if v.tree in set(rows)]
+    wanted = set(rows)
+    parts = [v.cloud + topo.p[v.tree].astype(np.float32) for v in topo.viewpoints if v.tree in wanted]
     return np.concatenate([*parts, np.zeros((0, 3), np.float32)])

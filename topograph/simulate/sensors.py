@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from topograph.geometry import Array, Stamps, from_xyz_rpy, planar, se3, yaw_of
+from topograph.geometry import Array, Stamps, from_xyz_rpy, interpolate, planar, se3, yaw_of
 from topograph.simulate.config import SensorConfig
 from topograph.simulate.drive import STEP_S, Drive
 
@@ -171,8 +171,6 @@ def columns(drive: Drive, config: SensorConfig, start_ns: int) -> Array:
     span_ns = int(1e9 / config.sweep_hz)
     knots = start_ns + np.linspace(0, span_ns, 11).astype(np.int64)
     fine = start_ns + (np.arange(config.columns) * (span_ns / config.columns)).astype(np.int64)
-    from topograph.geometry import interpolate
-
     return interpolate(knots, drive.at(knots) @ MOUNTS["velodyne"], fine)
 
 

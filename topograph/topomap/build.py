@@ -110,8 +110,7 @@ def _viewpoints(
 def _first_branch(n: int, viewpoints: Sequence[Viewpoint], axes: Array) -> Array:
     """Height (T,) at which the bare trunk ends, where it ends within what was traced (1.5 m); else NaN."""
     out = np.full(n, np.nan)
-    for j in range(n):
-        tops = [float(np.percentile(v.cloud @ axes[j], 98)) for v in viewpoints if v.tree == j and len(v.cloud) > 30]
-        if tops and 0.4 < max(tops) < 1.5:
-            out[j] = max(tops)
-    return out
+    for v in viewpoints:
+        if len(v.cloud) > 30:
+            out[v.tree] = np.fmax(out[v.tree], np.percentile(v.cloud @ axes[v.tree], 98))
+    return np.where((out > 0.4) & (out < 1.5), out, np.nan)

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import Delaunay, QhullError
+from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from topograph.geometry import Array
 
@@ -44,8 +44,6 @@ def neighbours(xy: Array, config: TopomapConfig) -> NDArray[np.int64]:
     if config.edges == "radius":
         d = np.linalg.norm(xy[:, None] - xy[None], axis=2) if n <= 4000 else None
         if d is None:
-            from scipy.spatial import cKDTree
-
             return np.asarray(np.sort(cKDTree(xy).query_pairs(config.radius, output_type="ndarray"), axis=1), np.int64)
         i, j = np.nonzero(np.triu(d < config.radius, 1))
         return np.stack([i, j], axis=1).astype(np.int64)
@@ -53,8 +51,6 @@ def neighbours(xy: Array, config: TopomapConfig) -> NDArray[np.int64]:
     keep = np.ones(len(pairs), bool)
     middle = 0.5 * (xy[pairs[:, 0]] + xy[pairs[:, 1]])
     half2 = 0.25 * np.sum((xy[pairs[:, 0]] - xy[pairs[:, 1]]) ** 2, axis=1)
-    from scipy.spatial import cKDTree
-
     distance, _ = cKDTree(xy).query(middle)
     keep &= distance**2 >= half2 * (1 - 1e-9)
     pairs = pairs[keep]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,14 +35,15 @@ def merge(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64], config: To
     row_of_new[tree_of_old[seen]] = np.flatnonzero(seen)
     row_of_new[fresh] = len(old) + np.arange(len(fresh))
     views = list(old.viewpoints)
+    of_tree: dict[int, list[int]] = defaultdict(list)
+    for i, v in enumerate(views):
+        of_tree[v.tree].append(i)
     for v in new.viewpoints:
         moved = Viewpoint(int(row_of_new[v.tree]), v.direction, v.cloud)
-        twin = [
-            i
-            for i, o in enumerate(views)
-            if o.tree == moved.tree and float(o.direction @ v.direction) > config.viewpoint_cosine
-        ]
+        mine = of_tree[moved.tree]
+        twin = [i for i in mine if float(views[i].direction @ v.direction) > config.viewpoint_cosine]
         if not twin:
+            mine.append(len(views))
             views.append(moved)
         elif len(v.cloud) > len(views[twin[0]].cloud):
             views[twin[0]] = moved

@@ -1,0 +1,75 @@
+"""Settings of localization."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizeConfig:
+    """What the localizer believes of detections, map and motion. Lengths in m, angles in rad.
+
+    Attributes:
+        risk: it commits when all rivals together are less probable than this.
+        view: farthest trunk that is used.
+        seen: chance that a trunk in view is detected in one scan; held against what the run shows.
+        clutter: share of detections that are no lasting object.
+        new, felled: share of trees that are not in the map; of mapped trees that are gone or never seen.
+        map_sigma: least standard deviation of a mapped tree per axis: what its covariance does not know.
+        trunk_sigma: added to every detection's deviation: the centre depends on the side that is seen.
+        diameter_sigma: least deviation between a diameter as mapped and as measured.
+        scales, scale_prior: noise scales that are marginalised and their prior.
+        unknown: prior of being somewhere that is not on the map, among trees at random.
+        alike: prior of being in another orchard of the same design. Small: it is the guard against a placement that fits
+            better than all others and still not well.
+        gate: chi-square (2 dof) of a match.
+        pair: longest pair of trees in the index.
+        anchors: chance of missing the right place that the choice of anchor pairs leaves.
+        bound: nats below the best at which an alignment is dropped.
+        modes: alignments that are evaluated with their full covariance.
+        information: share of ln(4 N / risk) that a submap must hold before it is searched.
+        again: distance between two full searches of large maps.
+        landmarks: most landmarks of a submap that are searched with.
+        forget: distance after which an unseen landmark is dropped.
+        lost, slip: thresholds of the two cumulative sums (nats).
+        shadow: distance after which the shadow's submap begins anew.
+        degraded: standard deviation of the position above which tracking is called degraded.
+        along, across, step, yaw_gyro, yaw_rate, yaw_wheels, yaw_distance: noise of dead reckoning; shares of the distance
+            and of the turn, m a step, rad/√s with a gyro, rad/√m without.
+        planar_tilt: deviation of roll and pitch where no IMU holds them.
+    """
+
+    risk: float = 1e-4
+    view: float = 25.0
+    seen: float = 0.8
+    clutter: float = 0.1
+    new: float = 0.04
+    felled: float = 0.04
+    map_sigma: float = 0.03
+    trunk_sigma: float = 0.015
+    diameter_sigma: float = 0.03
+    scales: tuple[float, ...] = (1.0, 1.5, 2.2)
+    scale_prior: tuple[float, ...] = (0.9, 0.07, 0.03)
+    unknown: float = 0.02
+    alike: float = 5e-5
+    gate: float = 13.8
+    pair: float = 16.0
+    anchors: float = 1e-3
+    bound: float = 25.0
+    modes: int = 300
+    information: float = 0.35
+    again: float = 2.0
+    landmarks: int = 40
+    forget: float = 40.0
+    lost: float = 12.0
+    slip: float = 30.0
+    shadow: float = 5.0
+    degraded: float = 0.3
+    along: float = 0.03
+    across: float = 0.02
+    step: float = 0.004
+    yaw_gyro: float = 0.004
+    yaw_rate: float = 5e-4
+    yaw_wheels: float = 0.08
+    yaw_distance: float = 0.01
+    planar_tilt: float = 0.06

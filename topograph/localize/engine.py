@@ -1,0 +1,313 @@
+"""Search, commit, track, lose: localization in the plane, one scan at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from topograph.geometry import Array
+from topograph.localize.config import LocalizeConfig
+from topograph.localize.evidence import Posterior, describe, nothing, weigh
+from topograph.localize.filter import Filter
+from topograph.localize.index import MapIndex
+from topograph.localize.search import Found, search
+from topograph.localize.submap import BINS, Move, Submap, Sweep, Visibility, assign, in_view, sectors
+
+STATES = ("searching", "ambiguous", "tracking", "degraded", "lost")
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """What is believed after a scan.
+
+    Attributes:
+        state: one of `STATES`.
+        pose: (3,) x, y, yaw of the robot in the map when committed, else None; `cov` (3, 3) m², m rad, rad².
+        hypotheses: places that together hold 99 % of what is on the map; 1 when committed.
+        risk: chance that the pose (or the best place) is wrong.
+        places: (H, 3) the robot's poses of those hypotheses, most probable first, and `weights` (H,).
+        trees: rows of the mapped trees seen in this scan.
+    """
+
+    state: str
+    pose: Array | None
+    cov: Array
+    hypotheses: int
+    risk: float
+    places: Array
+    weights: Array
+    trees: NDArray[np.int64]
+
+    @property
+    def committed(self) -> bool:
+        return self.pose is not None
+
+
+@dataclass(slots=True)
+class _Hunt:
+    """One attempt to find the place: a submap, what the last search found, and what that is worth now."""
+
+    submap: Submap
+    found: Found | None = None
+    posterior: Posterior = field(default_factory=nothing)
+    rows: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    searched: float = -1e9
+    weighed: tuple[float, int] = (-1e9, 0)
+    informed: bool = False
+
+
+class Engine:
+    """The localizer's core: `step` takes a motion and the trunks of a scan, and says what to believe."""
+
+    def __init__(self, index: MapIndex, config: LocalizeConfig) -> None:
+        self.index, self.config = index, config
+        self.visibility = Visibility(config)
+        self.hunt = _Hunt(Submap(config, self.visibility))
+        self.track: Filter | None = None
+        self.state = "searching"
+        self.risk = 1.0
+        self.sums = np.zeros(2)
+        self._matched_at = 0.0
+        self.losses = 0
+
+    def step(self, move: Move, sweep: Sweep) -> Belief:
+        """One scan further."""
+        self.hunt.submap.step(move, sweep)
+        if self.track is None:
+            self._look()
+            if self.hunt.posterior.risk <= self.config.risk:
+                known = self.hunt.posterior.tree[0]
+                self._commit()
+                return self._belief(np.unique(known[known >= 0]))
+            self._restart_when_stale()
+            return self._belief(np.zeros(0, np.int64))
+        trees = self._follow(self.track, move, sweep)
+        self._shadow()
+        if self.sums[0] > self.config.lost or self.sums[1] > self.config.slip:
+            self._lose(move, sweep)
+        return self._belief(trees)
+
+    # -- searching ------------------------------------------------------------------------------------------------
+
+    def _look(self) -> None:
+        """Search, or weigh anew what was found, as the submap grows."""
+        h, c = self.hunt, self.config
+        f = h.submap.filter
+        if f.n < 2:
+            return
+        key = (f.run, f.n)
+        if f.run - h.weighed[0] < 0.25 and f.n <= h.weighed[1] and h.submap.scans % 5:
+            return
+        h.weighed = key
+        marks, rows = describe(h.submap, self.index, c)
+        s2 = self.index.jitter**2
+        bits = np.log1p(s2 / (marks.var + c.map_sigma**2)) * marks.lasting
+        if self.index.diameter_sd > 0:
+            ok = np.isfinite(marks.diameter)
+            bits[ok] += 0.5 * np.log1p(self.index.diameter_sd**2 / marks.diameter_var[ok]) * marks.lasting[ok]
+        need = c.information * np.log(4.0 * len(self.index) / c.risk)
+        if float(bits.sum()) < need:
+            return
+        h.informed = True
+        small = len(self.index.length) < 30000
+        if not small and h.found is not None and f.run - h.searched < c.again:
+            h.posterior, h.rows = weigh(self._kept(h), marks, h.submap, self.index, c), rows
+            if h.posterior.risk > c.risk:
+                return
+        h.found = search(marks, self.index, c)
+        h.searched = f.run
+        h.posterior, h.rows = weigh(h.found, marks, h.submap, self.index, c), rows
+
+    @staticmethod
+    def _kept(h: _Hunt) -> Found:
+        assert h.found is not None
+        p = h.posterior
+        return Found(p.pose, -p.log, 0.0 if p.rest < 1e-9 else h.found.rest, h.found.seeds)
+
+    def _restart_when_stale(self) -> None:
+        """A long drive that fits nowhere begins anew: dead reckoning has bent the submap, or it began off the map."""
+        h = self.hunt
+        if h.submap.filter.run > 3.0 * self.config.forget and h.posterior.unknown > 0.5:
+            self.hunt = _Hunt(Submap(self.config, self.visibility))
+
+    def _commit(self) -> None:
+        h = self.hunt
+        self.track = anchored(h, self.index, self.config)
+        self.risk = h.posterior.risk
+        self.state = "tracking"
+        self.sums[:] = 0.0
+        self._matched_at = self.track.run
+        self.hunt = _Hunt(Submap(self.config, self.visibility))
+
+    # -- tracking -------------------------------------------------------------------------------------------------
+
+    def _follow(self, f: Filter, move: Move, sweep: Sweep) -> NDArray[np.int64]:
+        c, index = self.config, self.index
+        f.predict(move.step, move.cov, move.distance)
+        near = np.hypot(*sweep.p.T) < c.view if len(sweep) else np.zeros(0, bool)
+        z, R = sweep.p[near], sweep.cov[near] + c.trunk_sigma**2 * np.eye(2)
+        self._bring_in(f)
+        m2, logdet = f.innovations(z, R)
+        match = assign(m2, logdet, c.gate)
+        blocked = sectors(z)
+        reach, hidden = in_view(f.mean, f.n, blocked)
+        found = np.zeros(f.n, bool)
+        found[match[match >= 0]] = True
+        self._suspect(f, z, m2, logdet, match, found, reach, hidden)
+        looked = found | (~hidden & (reach < c.view))
+        f.looks[looked] += 1
+        d, dv = sweep.diameter[near], sweep.diameter_var[near]
+        lonely = (match < 0) & ((m2 > 2.5 * c.gate).all(axis=1) if f.n else np.ones(len(z), bool))
+        for i in np.flatnonzero(match >= 0):
+            k = int(match[i])
+            f.update(k, z[i], R[i])
+            f.count(k, d[i], dv[i], float(np.hypot(*z[i])))
+        for i in np.flatnonzero(lonely):
+            k = f.add(z[i], R[i])
+            f.looks[k] = 1
+            f.count(k, d[i], dv[i], float(np.hypot(*z[i])))
+        matched = match[match >= 0]
+        trees = f.tree[matched][f.tree[matched] >= 0].copy()
+        if len(trees):
+            self._matched_at = f.run
+        away = np.hypot(*(f.landmarks - f.mean[:2]).T) > c.view + 8.0
+        stale = (f.tree < 0) & (((f.looks >= 6) & (f.hits < 0.25 * f.looks)) | (f.run - f.seen > 15.0))
+        f.keep(~(away | stale))
+        sigma = float(np.sqrt(max(f.cov[0, 0], f.cov[1, 1])))
+        self.state = "degraded" if sigma > c.degraded or f.run - self._matched_at > 15.0 else "tracking"
+        if sigma > 5.0 * c.degraded:
+            self.sums[0] = np.inf
+        return trees
+
+    def _bring_in(self, f: Filter) -> None:
+        """Mapped trees that come into view become landmarks with the map's covariance."""
+        rows = self.near(f.mean[:2], self.config.view + 3.0)
+        for t in rows[~np.isin(rows, f.tree)]:
+            f.place(self.index.xy[t], (self.index.var[t] + self.config.map_sigma**2) * np.eye(2), int(t))
+
+    def near(self, xy: Array, reach: float) -> NDArray[np.int64]:
+        """Rows of mapped trees within `reach` of a place."""
+        i = self.index
+        return _within(xy, reach, i.xy, i.origin, i.bucket, i.buckets, i.start, i.member)
+
+    def _suspect(
+        self, f: Filter, z: Array, m2: Array, logdet: Array, match: NDArray[np.int64], found: NDArray[np.bool_],
+        reach: Array, hidden: NDArray[np.bool_],
+    ) -> None:  # fmt: skip
+        """Two cumulative sums (Page 1954): lost against tracked, and moved by a lattice vector against tracked."""
+        c, index = self.config, self.index
+        table = self.visibility.table()
+        passing = self.visibility.clutter(c.view)
+        here = np.log(0.75 * index.density + passing)
+        lost = slip = 0.0
+        c_, s_ = np.cos(f.mean[2]), np.sin(f.mean[2])
+        for i in range(len(z)):
+            k = match[i]
+            if k >= 0:
+                if f.tree[k] < 0:
+                    continue
+                own = -0.5 * m2[i, k] - 0.5 * logdet[i, k] - np.log(2 * np.pi)
+                lost += here - own
+                ratio = 1.0 + 2 * index.jitter**2 / np.exp(0.5 * logdet[i, k])
+                slip += min(0.5 * m2[i, k] * (1 - 1 / ratio) - np.log(ratio), 2.5)
+            elif f.n == 0 or m2[i].min() > 2.5 * c.gate:
+                at = f.mean[:2] + [c_ * z[i, 0] - s_ * z[i, 1], s_ * z[i, 0] + c_ * z[i, 1]]
+                if len(self.near(at, 1.3 / np.sqrt(index.density))):  # trees beyond the map's edge say nothing
+                    lost += here - np.log(c.new * index.density + passing)
+        steady = (f.tree >= 0) & (f.hits >= 3) & (f.hits > 0.6 * f.looks) & ~found & ~hidden & (reach < 0.8 * c.view)
+        chance = table[np.searchsorted(BINS, reach[steady])]
+        lost += float(np.sum(np.minimum(-0.5 * np.log(1.0 - chance), 1.0)))
+        self.sums[0] = max(0.0, self.sums[0] + lost)
+        self.sums[1] = max(0.0, self.sums[1] + slip)
+
+    def _shadow(self) -> None:
+        """A second opinion without a prior, from a submap that begins anew every few metres."""
+        h, c = self.hunt, self.config
+        f = h.submap.filter
+        if f.run - h.searched >= 1.0 or f.run >= c.shadow:
+            self._look()
+            h.searched = f.run
+            p = h.posterior
+            if len(p.pose) and p.risk <= c.risk and self.track is not None:
+                other = anchored(h, self.index, c)
+                apart = np.hypot(*(other.mean[:2] - self.track.mean[:2]))
+                turn = abs((other.mean[2] - self.track.mean[2] + np.pi) % (2 * np.pi) - np.pi)
+                if apart > 1.0 + 3 * np.sqrt(self.track.cov[0, 0]) or turn > 0.2:
+                    self.losses += 1
+                    self._commit()
+                    return
+                self.risk = p.risk
+        if f.run >= c.shadow:
+            self.hunt = _Hunt(Submap(c, self.visibility))
+
+    def _lose(self, move: Move, sweep: Sweep) -> None:
+        """The evidence has turned: forget the pose and begin with this scan."""
+        self.track = None
+        self.state = "lost"
+        self.risk = 1.0
+        self.losses += 1
+        self.sums[:] = 0.0
+        self.hunt = _Hunt(Submap(self.config, self.visibility))
+        still = Move(np.zeros(3), np.zeros((3, 3)), 0.0)
+        self.hunt.submap.step(still, sweep)
+
+    # -- saying ---------------------------------------------------------------------------------------------------
+
+    def _belief(self, trees: NDArray[np.int64]) -> Belief:
+        f = self.track
+        if f is not None:
+            pose = f.mean[:3].copy()
+            return Belief(self.state, pose, f.cov[:3, :3].copy(), 1, self.risk, pose[None], np.ones(1), trees)
+        p = self.hunt.posterior
+        n = 0
+        if len(p.p) and p.p.sum() > 0:
+            n = int(np.searchsorted(np.cumsum(p.p) / p.p.sum(), 0.99) + 1)
+        if n and p.unknown < 0.5:
+            self.state = "ambiguous"
+        elif self.state != "lost" or self.hunt.informed:
+            self.state = "searching"
+        robot = self.hunt.submap.filter.mean[:3]
+        shown = p.pose[: min(n, 200)]
+        c, s = np.cos(shown[:, 2]), np.sin(shown[:, 2])
+        places = np.stack(
+            [shown[:, 0] + c * robot[0] - s * robot[1], shown[:, 1] + s * robot[0] + c * robot[1], shown[:, 2] + robot[2]], axis=1
+        )  # fmt: skip
+        return Belief(self.state, None, np.full((3, 3), np.nan), n, p.risk, places, p.p[: len(places)], trees)
+
+
+def anchored(hunt: _Hunt, index: MapIndex, config: LocalizeConfig) -> Filter:
+    """The submap's filter put onto the map by its best placement: matched landmarks are tied to their trees."""
+    p = hunt.posterior
+    x, y, yaw = p.pose[0]
+    f = hunt.submap.filter.moved(float(x), float(y), float(yaw), np.array([3.0, 3.0, 0.2]))
+    scale = float(p.scale[0]) ** 2
+    for k, t in zip(hunt.rows, p.tree[0], strict=True):
+        if t >= 0:
+            f.fix(int(k), index.xy[t], scale * (index.var[t] + config.map_sigma**2) * np.eye(2))
+            f.tree[k] = t
+    f.mean[2] = (f.mean[2] + np.pi) % (2 * np.pi) - np.pi
+    return f
+
+
+@njit(cache=True)
+def _within(at, reach, xy, origin, bucket, buckets, start, member):
+    out = np.empty(64, np.int64)
+    n = 0
+    x0, x1 = int(max(0.0, (at[0] - reach - origin[0]) / bucket)), int(min(buckets[0] - 1.0, (at[0] + reach - origin[0]) / bucket))
+    y0, y1 = int(max(0.0, (at[1] - reach - origin[1]) / bucket)), int(min(buckets[1] - 1.0, (at[1] + reach - origin[1]) / bucket))
+    for bx in range(x0, x1 + 1):
+        for by in range(y0, y1 + 1):
+            cell = bx * buckets[1] + by
+            for q in range(start[cell], start[cell + 1]):
+                t = member[q]
+                if (xy[t, 0] - at[0]) ** 2 + (xy[t, 1] - at[1]) ** 2 <= reach * reach:
+                    if n == len(out):
+                        more = np.empty(2 * n, np.int64)
+                        more[:n] = out
+                        out = more
+                    out[n] = t
+                    n += 1
+    return out[:n].copy()

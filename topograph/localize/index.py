@@ -1,0 +1,142 @@
+"""The map as the search sees it: nearest tree, pairs by length, irregularity. Below 1 kB a tree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from topograph.geometry import Array
+
+
+@dataclass(frozen=True, slots=True)
+class MapIndex:
+    """Trees in the plane, and what answers the search's questions in constant time.
+
+    Attributes:
+        xy: (T, 2) m; `var` (T,) variance per axis, m²; `diameter` (T,) m or NaN.
+        origin, cell: of the raster `nearest` (X, Y): the tree nearest to each cell's centre, -1: none near.
+        bucket, start, member: coarse cells of `bucket` m (see `buckets`) and their trees (CSR).
+        buckets: (2,) number of coarse cells along x and y.
+        length: (P,) rising; `a`, `b` (P,) the pairs of trees so far apart.
+        density: trees per m² where there are trees.
+        area: m² in which the robot may be.
+        jitter: irregularity of the planting per axis, m, without the map's own error.
+        diameter_mean, diameter_sd: of the population.
+    """
+
+    xy: Array
+    var: Array
+    diameter: Array
+    origin: Array
+    cell: float
+    nearest: NDArray[np.int32]
+    bucket: float
+    buckets: NDArray[np.int64]
+    start: NDArray[np.int32]
+    member: NDArray[np.int32]
+    length: NDArray[np.float32]
+    a: NDArray[np.int32]
+    b: NDArray[np.int32]
+    density: float
+    area: float
+    jitter: float
+    diameter_mean: float
+    diameter_sd: float
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the index."""
+        arrays = (self.xy, self.var, self.diameter, self.nearest, self.start, self.member, self.length, self.a, self.b)
+        return sum(x.nbytes for x in arrays)
+
+
+def build_index(xy: Array, var: Array, diameter: Array, view: float, longest: float) -> MapIndex:
+    """Index of trees (T, 2) with variances per axis (T,) and diameters (T,) or NaN.
+
+    `view` is the range of detections (m); pairs up to `longest` are listed, fewer where trees are dense, so that a
+    tree has about 30.
+    """
+    tree = cKDTree(xy)
+    n = len(xy)
+    gap = float(np.median(tree.query(xy, min(2, n))[0][:, -1])) if n > 1 else 5.0
+    cell = float(np.clip(0.25 * gap, 0.25, 1.0))
+    low, high = xy.min(0) - 2.0, xy.max(0) + 2.0
+    while np.prod((high - low) / cell) > max(4e6, 100.0 * n):  # far islands of trees: a coarser raster
+        cell *= 1.4
+    shape = np.ceil((high - low) / cell).astype(int) + 1
+    nearest = np.full(shape, -1, np.int32)
+    _fill(nearest, xy, low, cell, int(np.ceil(0.5 * gap / cell)) + 1)
+    bucket = max(6.0, gap)
+    while np.prod((high - low) / bucket) > max(1e5, 4.0 * n):
+        bucket *= 1.5
+    buckets = np.ceil((high - low) / bucket).astype(np.int64) + 1
+    where = ((xy - low) / bucket).astype(np.int64)
+    flat = where[:, 0] * buckets[1] + where[:, 1]
+    order = np.argsort(flat, kind="stable").astype(np.int32)
+    start = np.searchsorted(flat[order], np.arange(buckets[0] * buckets[1] + 1)).astype(np.int32)
+    covered = np.unique(np.floor(xy / 10.0).astype(np.int64), axis=0)
+    density = float(n / max(_covered_area(xy, gap), 1.0))
+    # The neighbours within reach r number density * pi * r²; each pair stands once.
+    reach = float(np.clip(np.sqrt(60.0 / (np.pi * density)), 2.2 * gap, min(longest, 1.8 * view)))
+    pairs = tree.query_pairs(reach, output_type="ndarray")
+    length = np.linalg.norm(xy[pairs[:, 0]] - xy[pairs[:, 1]], axis=1) if len(pairs) else np.zeros(0)
+    by_length = np.argsort(length)
+    ok = np.isfinite(diameter)
+    area = float(np.prod(high - low + 10.0)) if len(covered) * 100.0 > 0.3 * np.prod(high - low) else len(covered) * 400.0
+    return MapIndex(
+        xy, var, diameter, low, cell, nearest, bucket, buckets, start, order,
+        length[by_length].astype(np.float32), pairs[by_length, 0].astype(np.int32), pairs[by_length, 1].astype(np.int32),
+        density, area, _jitter(tree, xy, var, gap),
+        float(np.mean(diameter[ok])) if ok.any() else np.nan, float(np.std(diameter[ok])) if ok.sum() > 1 else 0.0,
+    )  # fmt: skip
+
+
+def _covered_area(xy: Array, gap: float) -> float:
+    """m² under trees: cells of twice the spacing that hold some, each wide enough for about four."""
+    side = max(2.0 * gap, 2.0)
+    cells, counts = np.unique(np.floor(xy / side).astype(np.int64), axis=0, return_counts=True)
+    inner = counts >= 0.5 * np.median(counts)
+    return float(len(cells[inner]) * side * side * len(xy) / max(counts[inner].sum(), 1))
+
+
+@njit(cache=True)
+def _fill(nearest, xy, low, cell, reach):
+    best = np.full(nearest.shape, 1e18, np.float32)
+    for t in range(len(xy)):
+        cx = int((xy[t, 0] - low[0]) / cell)
+        cy = int((xy[t, 1] - low[1]) / cell)
+        for i in range(max(cx - reach, 0), min(cx + reach + 1, nearest.shape[0])):
+            for j in range(max(cy - reach, 0), min(cy + reach + 1, nearest.shape[1])):
+                dx = low[0] + (i + 0.5) * cell - xy[t, 0]
+                dy = low[1] + (j + 0.5) * cell - xy[t, 1]
+                d = dx * dx + dy * dy
+                if d < best[i, j]:
+                    best[i, j] = d
+                    nearest[i, j] = t
+
+
+def _jitter(tree: cKDTree, xy: Array, var: Array, gap: float, sample: int = 2000) -> float:
+    """Irregularity per axis, m: how far 2a - b, the mirror of neighbour b at tree a, is from the nearest tree.
+
+    In a lattice with planting error s the mirror is off by sqrt(6) s (tree, neighbour and the third one); the map's own
+    errors are taken out. Bounded by what scattered trees would give.
+    """
+    n = len(xy)
+    if n < 5:
+        return 0.25 * gap
+    rows = np.random.default_rng(0).permutation(n)[:sample]
+    _, near = tree.query(xy[rows], min(5, n))
+    mirror = (2 * xy[rows, None] - xy[near[:, 1:]]).reshape(-1, 2)
+    d, third = tree.query(mirror)
+    inside = d < 0.45 * gap  # farther: a border or a gap, or no lattice at all
+    if inside.mean() < 0.25:
+        return 0.25 * gap
+    d2 = np.median(d[inside] ** 2) / 1.386  # median of chi-square with 2 dof
+    return float(np.sqrt(max(d2 - 6.0 * float(np.median(var)), 0.0) / 6.0))

@@ -12,6 +12,7 @@ from pydantic import TypeAdapter, ValidationError
 from topograph.bags import BagsConfig
 from topograph.errors import UsageError
 from topograph.estimate import EstimateConfig
+from topograph.localize import LocalizeConfig, ThesisConfig
 from topograph.motion import MotionConfig
 from topograph.topomap import TopomapConfig
 from topograph.trees import TreesConfig
@@ -28,6 +29,8 @@ class Config:
     trees: TreesConfig = field(default_factory=TreesConfig)
     estimate: EstimateConfig = field(default_factory=EstimateConfig)
     topomap: TopomapConfig = field(default_factory=TopomapConfig)
+    localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+    thesis: ThesisConfig = field(default_factory=ThesisConfig)
 
 
 class _Loader(yaml.SafeLoader):

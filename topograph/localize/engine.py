@@ -16,6 +16,7 @@ from topograph.localize.index import MapIndex
 from topograph.localize.search import Found, search
 from topograph.localize.submap import BINS, Move, Submap, Sweep, Visibility, assign, in_view, sectors
 
+NO_PAIRS = np.zeros((0, 2), np.int64)
 STATES = ("searching", "ambiguous", "tracking", "degraded", "lost")
 
 
@@ -29,7 +30,7 @@ class Belief:
         hypotheses: places that together hold 99 % of what is on the map; 1 when committed.
         risk: chance that the pose (or the best place) is wrong.
         places: (H, 3) the robot's poses of those hypotheses, most probable first, and `weights` (H,).
-        trees: rows of the mapped trees seen in this scan.
+        pairs: (K, 2) rows of the sweep's trunks and of the mapped trees that they are.
     """
 
     state: str
@@ -39,7 +40,7 @@ class Belief:
     risk: float
     places: Array
     weights: Array
-    trees: NDArray[np.int64]
+    pairs: NDArray[np.int64]
 
     @property
     def committed(self) -> bool:
@@ -79,16 +80,17 @@ class Engine:
         if self.track is None:
             self._look()
             if self.hunt.posterior.risk <= self.config.risk:
-                known = self.hunt.posterior.tree[0]
                 self._commit()
-                return self._belief(np.unique(known[known >= 0]))
+                assert self.track is not None
+                return self._belief(self._pairs(self.track, sweep))
             self._restart_when_stale()
-            return self._belief(np.zeros(0, np.int64))
-        trees = self._follow(self.track, move, sweep)
+            return self._belief(NO_PAIRS)
+        pairs = self._follow(self.track, move, sweep)
         self._shadow()
         if self.sums[0] > self.config.lost or self.sums[1] > self.config.slip:
-            self._lose(move, sweep)
-        return self._belief(trees)
+            self._lose(sweep)
+            return self._belief(NO_PAIRS)
+        return self._belief(pairs)
 
     # -- searching ------------------------------------------------------------------------------------------------
 
@@ -145,6 +147,7 @@ class Engine:
     # -- tracking -------------------------------------------------------------------------------------------------
 
     def _follow(self, f: Filter, move: Move, sweep: Sweep) -> NDArray[np.int64]:
+        """One scan of tracking; the pairs of trunks and mapped trees."""
         c, index = self.config, self.index
         f.predict(move.step, move.cov, move.distance)
         near = np.hypot(*sweep.p.T) < c.view if len(sweep) else np.zeros(0, bool)
@@ -169,9 +172,10 @@ class Engine:
             k = f.add(z[i], R[i])
             f.looks[k] = 1
             f.count(k, d[i], dv[i], float(np.hypot(*z[i])))
-        matched = match[match >= 0]
-        trees = f.tree[matched][f.tree[matched] >= 0].copy()
-        if len(trees):
+        mapped = np.flatnonzero(match >= 0)
+        mapped = mapped[f.tree[match[mapped]] >= 0]
+        pairs = np.stack([np.flatnonzero(near)[mapped], f.tree[match[mapped]]], axis=1)
+        if len(pairs):
             self._matched_at = f.run
         away = np.hypot(*(f.landmarks - f.mean[:2]).T) > c.view + 8.0
         stale = (f.tree < 0) & (((f.looks >= 6) & (f.hits < 0.25 * f.looks)) | (f.run - f.seen > 15.0))
@@ -180,13 +184,22 @@ class Engine:
         self.state = "degraded" if sigma > c.degraded or f.run - self._matched_at > 15.0 else "tracking"
         if sigma > 5.0 * c.degraded:
             self.sums[0] = np.inf
-        return trees
+        return pairs
 
     def _bring_in(self, f: Filter) -> None:
         """Mapped trees that come into view become landmarks with the map's covariance."""
         rows = self.near(f.mean[:2], self.config.view + 3.0)
         for t in rows[~np.isin(rows, f.tree)]:
             f.place(self.index.xy[t], (self.index.var[t] + self.config.map_sigma**2) * np.eye(2), int(t))
+
+    def _pairs(self, f: Filter, sweep: Sweep) -> NDArray[np.int64]:
+        """Trunks of a sweep that are known landmarks on mapped trees, without an update."""
+        if not len(sweep) or not f.n:
+            return NO_PAIRS
+        match = assign(*f.innovations(sweep.p, sweep.cov), self.config.gate)
+        rows = np.flatnonzero(match >= 0)
+        rows = rows[f.tree[match[rows]] >= 0]
+        return np.stack([rows, f.tree[match[rows]]], axis=1)
 
     def near(self, xy: Array, reach: float) -> NDArray[np.int64]:
         """Rows of mapped trees within `reach` of a place."""
@@ -243,7 +256,7 @@ class Engine:
         if f.run >= c.shadow:
             self.hunt = _Hunt(Submap(c, self.visibility))
 
-    def _lose(self, move: Move, sweep: Sweep) -> None:
+    def _lose(self, sweep: Sweep) -> None:
         """The evidence has turned: forget the pose and begin with this scan."""
         self.track = None
         self.state = "lost"
@@ -256,11 +269,11 @@ class Engine:
 
     # -- saying ---------------------------------------------------------------------------------------------------
 
-    def _belief(self, trees: NDArray[np.int64]) -> Belief:
+    def _belief(self, pairs: NDArray[np.int64]) -> Belief:
         f = self.track
         if f is not None:
             pose = f.mean[:3].copy()
-            return Belief(self.state, pose, f.cov[:3, :3].copy(), 1, self.risk, pose[None], np.ones(1), trees)
+            return Belief(self.state, pose, f.cov[:3, :3].copy(), 1, self.risk, pose[None], np.ones(1), pairs)
         p = self.hunt.posterior
         n = 0
         if len(p.p) and p.p.sum() > 0:
@@ -275,7 +288,7 @@ class Engine:
         places = np.stack(
             [shown[:, 0] + c * robot[0] - s * robot[1], shown[:, 1] + s * robot[0] + c * robot[1], shown[:, 2] + robot[2]], axis=1
         )  # fmt: skip
-        return Belief(self.state, None, np.full((3, 3), np.nan), n, p.risk, places, p.p[: len(places)], trees)
+        return Belief(self.state, None, np.full((3, 3), np.nan), n, p.risk, places, p.p[: len(places)], pairs)
 
 
 def anchored(hunt: _Hunt, index: MapIndex, config: LocalizeConfig) -> Filter:

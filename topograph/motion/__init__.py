@@ -1,14 +1,17 @@
 """Odometry + Imu -> Motion: where dead reckoning says the robot is, at any stamp. No map, no trunks."""
 
 from topograph.motion.inertial import Inertial, align_imu
+from topograph.motion.online import Leg, Reckoner
 from topograph.motion.reckon import Motion, MotionConfig, dead_reckon
 from topograph.motion.streams import Streams, StreamsBuilder
 from topograph.motion.twist import twist_during
 
 __all__ = [
     "Inertial",
+    "Leg",
     "Motion",
     "MotionConfig",
+    "Reckoner",
     "Streams",
     "StreamsBuilder",
     "align_imu",

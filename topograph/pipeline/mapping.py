@@ -1,25 +1,21 @@
-"""Straight lines from bags to a map, and the one loop: associate <-> solve."""
+"""Straight lines from a run to a map, and the one loop: associate <-> solve."""
 
 from __future__ import annotations
 
-import logging
 import time
-from collections import Counter
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from topograph.bags import Recording, Scan, Trunks
 from topograph.config import Config
-from topograph.errors import InputError, InsufficientDataError
+from topograph.errors import InsufficientDataError
 from topograph.estimate import Estimate, KnownTrees, Link, Problem, average, graph, path_at
 from topograph.estimate.assemble import assemble, choose_datum
 from topograph.evaluate import Metric, fix_metrics
 from topograph.geometry import Array, inverse, transform
-from topograph.motion import Motion, Streams, StreamsBuilder, align_imu, dead_reckon, twist_during
+from topograph.motion import Motion, align_imu, dead_reckon
+from topograph.pipeline.read import Progress, Run, silent
 from topograph.topomap import TopoMap, build, merge
 from topograph.trees import (
     Detections,
@@ -33,41 +29,6 @@ from topograph.trees import (
     refine,
     tabulate,
 )
-from topograph.trunks import TrunksConfig, from_recorded
-
-log = logging.getLogger(__name__)
-
-Progress = Callable[[str, float], None]
-
-
-def _silent(stage: str, share: float) -> None:
-    """No progress shown."""
-
-
-@dataclass(frozen=True, slots=True)
-class Run:
-    """What was read of a recording.
-
-    Attributes:
-        streams: the small streams.
-        trunks: trunks of each scan in `base_link`, in time order.
-        mounts: "imu", "fix", "heading" -> robot_T_sensor, or None where no transform is known.
-        chosen: stream kind -> topic.
-        skipped: reason -> count.
-        notes: what had to be assumed.
-        scans, seconds, duration_s: counted, spent reading and detecting, recorded.
-    """
-
-    streams: Streams
-    trunks: list[Trunks]
-    mounts: dict[str, Array | None]
-    child_T_robot: Array
-    chosen: dict[str, str]
-    skipped: Counter[str]
-    notes: list[str]
-    scans: int
-    seconds: float
-    duration_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,100 +58,13 @@ class Solved:
     seconds: dict[str, float]
 
 
-def read_run(paths: Sequence[Path], config: Config, progress: Progress = _silent) -> Run:
-    """Read a run once: small streams into arrays, scans into trunks as they come.
-
-    Raises:
-        InputError: nothing usable in the bags.
-        FrameError: the LiDAR's frame is not known.
-    """
-    began = time.perf_counter()
-    notes: list[str] = []
-    with Recording(paths, config.bags) as recording:
-        detect = _detector(recording, config.trunks)
-        builder = StreamsBuilder()
-        pending: list[Scan] = []
-        trunks: list[Trunks] = []
-        scans = 0
-        newest = 0
-        expected = max(1, sum(recording.counts[t] for t in recording.chosen.values()))
-        for n, (_, product) in enumerate(recording.messages()):
-            if n % 200 == 0:
-                progress("read", n / expected)
-            newest = max(newest, product.stamp_ns)
-            if isinstance(product, Scan):
-                scans += 1
-                pending.append(product)
-            elif isinstance(product, Trunks):
-                scans += 1
-                trunks.append(from_recorded(product, recording.frames.get(product.frame), config.trunks))
-            else:
-                builder.add(product)
-            while pending and newest > pending[0].stamp_ns + 250_000_000:
-                trunks.append(detect(pending.pop(0), builder))
-        trunks += [detect(s, builder) for s in pending]
-        progress("read", 1.0)
-        streams = builder.build(recording.skipped)
-        mounts: dict[str, Array | None] = {
-            k: recording.frames.find(streams.frames[k]) for k in ("imu", "fix", "heading") if k in streams.frames
-        }
-        child = streams.frames.get("child", "")
-        base_T_child = recording.frames.find(child)
-        if base_T_child is None:
-            notes.append(f"odometry's frame {child!r} is not in TF: taken as {config.bags.base_frame!r}")
-            base_T_child = np.eye(4)
-        for k, name in (("fix", "antenna"), ("heading", "heading")):
-            if k in mounts and mounts[k] is None:
-                notes.append(
-                    f"{name} frame {streams.frames[k]!r} is not in TF: taken at the base; "
-                    f"add --extrinsic {streams.frames[k]}=X,Y,Z,ROLL,PITCH,YAW"
-                )
-        skipped = recording.skipped
-        chosen, duration = dict(recording.chosen), recording.duration_s
-    return Run(
-        streams,
-        trunks,
-        mounts,
-        inverse(base_T_child),
-        chosen,
-        skipped,
-        notes,
-        scans,
-        time.perf_counter() - began,
-        duration,
-    )
-
-
-def _detector(recording: Recording, config: TrunksConfig) -> Callable[[Scan, StreamsBuilder], Trunks]:
-    """Scan -> trunks in the base's frame, deskewed with what the small streams said around the scan."""
-    from topograph.trunks.detector import Detector
-
-    detectors: dict[str, Detector] = {}
-
-    def detect(scan: Scan, streams: StreamsBuilder) -> Trunks:
-        if scan.frame not in detectors:
-            detectors[scan.frame] = Detector(recording.frames.get(scan.frame), config)
-        robot_R_imu = None
-        if streams.imu:
-            mount = recording.frames.find(streams.imu[0].frame)
-            robot_R_imu = None if mount is None else mount[:3, :3]
-        first, last = scan.stamp_ns, scan.stamp_ns
-        if scan.offset is not None and len(scan.offset):
-            first += int(np.nanmin(scan.offset) * 1e9)
-            last += int(np.nanmax(scan.offset) * 1e9)
-        twist, _ = twist_during(first, last, streams.odometry, streams.imu, robot_R_imu)
-        return detectors[scan.frame](scan, twist)
-
-    return detect
-
-
 def solve_run(
     run: Run,
     config: Config,
     *,
     check_fixes: int = 0,
     known: TopoMap | None = None,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> Solved:
     """Associate and solve. Every `check_fixes`-th fix is withheld from the estimator and kept for checking.
 
@@ -518,21 +392,3 @@ def extend(old: TopoMap, new: TopoMap, solved: Solved, config: Config) -> TopoMa
     known = solved.problem.known
     assert known is not None
     return merge(old, new, known.tree, config.topomap)
-
-
-def scan_near(
-    paths: Sequence[Path], config: Config, stamp_ns: int, trunks: Sequence[Trunks]
-) -> tuple[Scan, Array, Trunks]:
-    """The scan nearest to a stamp, the LiDAR's mounting, and the trunks found in it."""
-    with Recording(paths, config.bags) as recording:
-        best: Scan | None = None
-        for _, m in recording.messages(["points"]):
-            assert isinstance(m, Scan)
-            if best is None or abs(m.stamp_ns - stamp_ns) < abs(best.stamp_ns - stamp_ns):
-                best = m
-            elif m.stamp_ns > stamp_ns:
-                break
-        if best is None:
-            raise InputError("no point cloud to draw: the recording holds trunk detections only")
-        mount = recording.frames.get(best.frame)
-    return best, mount, min(trunks, key=lambda t: abs(t.stamp_ns - best.stamp_ns))

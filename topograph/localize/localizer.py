@@ -1,0 +1,200 @@
+"""The live door: messages in, poses out. A robot node is ten lines around it (examples/ros_node.py)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from topograph.bags import Imu, Odometry, Scan, Trunks
+from topograph.errors import InsufficientDataError
+from topograph.geometry import Array, from_xyz_rpy, transform
+from topograph.localize.config import LocalizeConfig
+from topograph.localize.engine import Belief, Engine
+from topograph.localize.index import build_index
+from topograph.localize.method import Fix, Method, Report
+from topograph.localize.submap import Move, Sweep
+from topograph.motion import Leg, Reckoner, twist_during
+from topograph.topomap import TopoMap
+
+Detect = Callable[[Scan, Array], Trunks]
+
+
+class Localizer:
+    """Where the robot is in a map, from trunks and dead reckoning, without GNSS and from anywhere.
+
+    Args:
+        topo: the map.
+        config: settings; `config.risk` is the chance of a wrong pose that is accepted.
+        detect: scan and twist (6,) -> trunks in `base_link`; needed only when scans are fed.
+        child_T_robot: (4, 4), from odometry's child frame to `base_link`.
+        robot_R_imu: (3, 3), the IMU's mounting; None: from gravity.
+        method: another method than the default (`thesis.ThesisMethod`).
+
+    Attributes:
+        report: what is believed since the last scan, also while there is no pose.
+    """
+
+    def __init__(
+        self, topo: TopoMap, config: LocalizeConfig | None = None, *, detect: Detect | None = None,
+        child_T_robot: Array | None = None, robot_R_imu: Array | None = None, method: Method | None = None,
+    ) -> None:  # fmt: skip
+        if len(topo) < 2:
+            raise InsufficientDataError(f"a map of {len(topo)} trees cannot be localized in: map more of the orchard")
+        self.config = config or LocalizeConfig()
+        self.method = method or GraphMethod(topo, self.config)
+        self.reckoner = Reckoner(child_T_robot, robot_R_imu)
+        self.report: Report | None = None
+        self._detect = detect
+        self._robot_R_imu = robot_R_imu
+        self._recent_odometry: list[Odometry] = []
+        self._recent_imu: list[Imu] = []
+
+    def update(self, scan: Scan | Trunks, odometry: Iterable[Odometry | Imu] = ()) -> Fix | None:
+        """One scan, and the odometry and IMU messages since the last one; the pose at the scan's stamp, or None.
+
+        Messages that are newer than the scan may be among them; they are kept for the next one.
+        """
+        for m in odometry:
+            self.reckoner.add(m)
+            (self._recent_imu if isinstance(m, Imu) else self._recent_odometry).append(m)  # type: ignore[arg-type]  # each list takes its own kind
+        if isinstance(scan, Scan):
+            if self._detect is None:
+                raise TypeError("a Localizer that is fed scans needs `detect`")
+            last = scan.stamp_ns + (0 if scan.offset is None or not len(scan.offset) else int(np.nanmax(scan.offset) * 1e9))
+            twist, _ = twist_during(scan.stamp_ns, last, self._recent_odometry, self._recent_imu, self._robot_R_imu)
+            scan = self._detect(scan, twist)
+        del self._recent_odometry[:-200], self._recent_imu[:-500]
+        self.leg = self.reckoner.advance(scan.stamp_ns)
+        self.report = self.method.step(scan, self.leg)
+        return self.report.fix
+
+
+class GraphMethod:
+    """Ours: submap, search, evidence, track (see `Engine`), lifted from the plane to six degrees of freedom."""
+
+    def __init__(self, topo: TopoMap, config: LocalizeConfig) -> None:
+        self.topo, self.config = topo, config
+        self.engine: Engine | None = None
+        self._tilt = np.zeros(3)  # z of the base in the map (m), and roll and pitch (rad) beyond what gravity says
+        self._tilt_cov = np.diag([100.0, 0.0, 0.0])
+        self._up = 0.0
+        self._row = _row_direction(topo)
+
+    def _begin(self, trunks: Trunks) -> Engine:
+        """The index is built at the height at which this front end states its trunks."""
+        above = trunks.height[np.isfinite(trunks.height)]
+        self.height = float(np.median(above)) if len(above) else 0.0
+        t = self.topo
+        xy = t.p[:, :2] + t.axis[:, :2] * (self.height / np.maximum(t.axis[:, 2:], 0.3))
+        var = 0.5 * (t.cov[:, 0, 0] + t.cov[:, 1, 1])
+        var = np.where(np.isfinite(var), np.clip(var - 0.5 * np.trace(t.datum_cov[:2, :2]), 0.0, 1.0), 0.0)
+        return Engine(build_index(xy, var, t.diameter, self.config.view, self.config.pair), self.config)
+
+    def step(self, trunks: Trunks, leg: Leg) -> Report:
+        """One scan further."""
+        if self.engine is None:
+            if not len(trunks):
+                return Report(trunks.stamp_ns, "searching", None, 0, 1.0, np.zeros((0, 3)), *_NONE, np.nan, np.nan)
+            self.engine = self._begin(trunks)
+        level_T_robot = from_xyz_rpy(0, 0, 0, leg.roll, leg.pitch, 0)
+        flat = transform(level_T_robot, trunks.p) if len(trunks) else np.zeros((0, 3))
+        self.move = move_of(leg, self.config)
+        self.sweep, rows = sweep_of(trunks, level_T_robot, leg, self.config)
+        belief = self.engine.step(self.move, self.sweep)
+        self.sweep_pairs = belief.pairs
+        belief = replace(belief, pairs=np.stack([rows[belief.pairs[:, 0]], belief.pairs[:, 1]], axis=1))
+        self._rise(leg, belief, trunks, flat)
+        fix = self._fix(trunks.stamp_ns, belief, leg) if belief.pose is not None else None
+        along = self._row @ belief.cov[:2, :2] @ self._row
+        side = np.array([-self._row[1], self._row[0]])
+        across = side @ belief.cov[:2, :2] @ side
+        ids = self.topo.ids[np.unique(belief.pairs[:, 1])]
+        return Report(
+            trunks.stamp_ns, belief.state, fix, belief.hypotheses, belief.risk, belief.places, ids, belief.pairs,
+            float(np.sqrt(along)), float(np.sqrt(across)),
+        )  # fmt: skip
+
+    def _rise(self, leg: Leg, belief: Belief, trunks: Trunks, flat: Array) -> None:
+        """Height, and what gravity leaves open of roll and pitch, from the heights at which known trees are seen."""
+        x, P = self._tilt, self._tilt_cov
+        if belief.pose is None:
+            x[:] = 0.0
+            P[:] = np.diag([1e4, 0.0, 0.0])
+            return
+        if P[0, 0] > 1e3:
+            tilt = (0.01 if leg.level else 0.12) ** 2
+            P[:] = np.diag([100.0, tilt, tilt])
+        x[0] += leg.up
+        drift = (0.001 if leg.level else 0.02) ** 2 * leg.distance
+        P += np.diag([(0.03 * leg.distance) ** 2 + 1e-6, drift, drift])
+        for i, t in belief.pairs:
+            ground = self.topo.p[t, 2] + (trunks.height[i] if np.isfinite(trunks.height[i]) else self.height)
+            H = np.array([1.0, flat[i, 1], -flat[i, 0]])
+            S = H @ P @ H + 0.12**2 + (0.01 * np.hypot(*flat[i, :2])) ** 2
+            r = ground - flat[i, 2] - H @ x
+            if r * r < 12.0 * S:
+                K = P @ H / S
+                x += K * r
+                P -= np.outer(K, H @ P)
+
+    def _fix(self, stamp_ns: int, belief: Belief, leg: Leg) -> Fix:
+        assert belief.pose is not None
+        px, py, yaw = belief.pose
+        T = from_xyz_rpy(px, py, self._tilt[0], leg.roll + self._tilt[1], leg.pitch + self._tilt[2], yaw)
+        cov = np.zeros((6, 6))
+        cov[np.ix_([3, 4, 2], [3, 4, 2])] = belief.cov
+        cov[np.ix_([5, 0, 1], [5, 0, 1])] = self._tilt_cov
+        cov[[0, 1], [0, 1]] += 0.01**2
+        return Fix(stamp_ns, T, cov, belief.risk)
+
+
+_NONE = (np.zeros(0, np.int64), np.zeros((0, 2), np.int64))
+
+
+def _row_direction(topo: TopoMap) -> Array:
+    """Unit vector (2,) along the rows; east where there are none."""
+    total = np.zeros(2)
+    for row in np.unique(topo.row[topo.row >= 0]):
+        p = topo.p[topo.row == row, :2]
+        if len(p) > 1:
+            d = np.linalg.svd(p - p.mean(0))[2][0]
+            total += d if d @ total >= 0 else -d
+    n = float(np.linalg.norm(total))
+    return total / n if n > 0 else np.array([1.0, 0.0])
+
+
+def move_of(leg: Leg, config: LocalizeConfig) -> Move:
+    """A leg's planar motion with its covariance."""
+    c = config
+    along = c.along * leg.distance + (c.step if leg.distance > 1e-4 else 1e-4)
+    across = c.across * leg.distance + (c.step if leg.distance > 1e-4 else 1e-4)
+    if not leg.wheels:
+        along = across = 0.5 * leg.seconds + 0.05
+    if leg.gyro:
+        yaw = np.hypot(c.yaw_gyro * leg.turned, c.yaw_rate * np.sqrt(max(leg.seconds, 0.0)))
+    else:
+        yaw = np.hypot(c.yaw_wheels * leg.turned, c.yaw_distance * np.sqrt(leg.distance))
+    if not leg.wheels and not leg.gyro:
+        yaw = 0.3 * leg.seconds + 0.02
+    return Move(leg.step, np.diag([along**2, across**2, yaw**2 + 1e-8]), leg.distance)
+
+
+def sweep_of(trunks: Trunks, level_T_robot: Array, leg: Leg, config: LocalizeConfig) -> tuple[Sweep, NDArray[np.int64]]:
+    """A scan's trunks seen from above, in the levelled robot frame, and their rows."""
+    if not len(trunks):
+        return Sweep(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0)), np.zeros(0, np.int64)
+    R = level_T_robot[:3, :3]
+    p = trunks.p @ R.T
+    across = np.eye(3) - trunks.axis[:, :, None] * trunks.axis[:, None, :]  # along itself a trunk may be anywhere
+    cov = across @ np.where(np.isfinite(trunks.cov), trunks.cov, 0.0) @ across
+    flat = np.array((R @ cov @ R.T)[:, :2, :2])
+    reach = np.hypot(p[:, 0], p[:, 1])
+    least = (0.02 + 0.001 * reach) ** 2
+    if not leg.level:
+        least = least + (reach * config.planar_tilt**2) ** 2
+    flat[:, [0, 1], [0, 1]] = np.maximum(flat[:, [0, 1], [0, 1]], least[:, None])
+    ok = np.isfinite(p).all(axis=1) & (reach > 0.3)
+    return Sweep(p[ok, :2], flat[ok], trunks.diameter[ok], np.full(int(ok.sum()), 0.04**2)), np.flatnonzero(ok)

@@ -1,0 +1,172 @@
+"""A map and a bag in, poses over time out: the bag is streamed through the same engine that runs live."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from topograph.bags import Imu, Odometry, Recording, Trunks
+from topograph.config import Config
+from topograph.errors import InsufficientDataError
+from topograph.geometry import Array
+from topograph.localize import Fix, GraphMethod, Localizer, Move, Report, Sweep, ThesisMethod, smooth
+from topograph.pipeline.read import Progress, child_mount, silent, stream
+from topograph.topomap import TopoMap
+
+
+@dataclass(slots=True)
+class Replay:
+    """A localized run.
+
+    Attributes:
+        reports: one per scan, in time order.
+        distance: (S,) metres driven at each scan.
+        smoothed: stamps (K,) and poses (K, 4, 4) of the committed scans, with what came later taken in.
+        skipped, notes, chosen: as in mapping.
+        seconds: per stage; `update_ms` of each scan.
+        exploded: scans in which the thesis's combinations exceeded their cap.
+    """
+
+    reports: list[Report] = field(default_factory=list)
+    distance: list[float] = field(default_factory=list)
+    smoothed: tuple[NDArray[np.int64], Array] = (np.zeros(0, np.int64), np.zeros((0, 4, 4)))
+    skipped: Counter[str] = field(default_factory=Counter)
+    notes: list[str] = field(default_factory=list)
+    chosen: dict[str, str] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    update_ms: list[float] = field(default_factory=list)
+    duration_s: float = 0.0
+    exploded: int = 0
+
+    @property
+    def fixes(self) -> list[Fix]:
+        """Committed poses."""
+        return [r.fix for r in self.reports if r.fix is not None]
+
+
+def localize_bags(
+    topo: TopoMap, paths: Sequence[Path], config: Config, method: str = "graph", progress: Progress = silent,
+    until_s: tuple[float, float] = (0.0, np.inf),
+) -> Replay:  # fmt: skip
+    """Replay bags against a map; `method` is "graph" or "thesis". GNSS in the bags is not read.
+
+    Only scans within `until_s` (from, to) seconds of the first message count.
+
+    Raises:
+        InsufficientDataError: neither scans nor odometry.
+    """
+    out = Replay()
+    began = time.perf_counter()
+    with Recording(paths, config.bags) as recording:
+        for kind in ("fix", "heading"):
+            recording.chosen.pop(kind, None)
+        out.chosen, out.duration_s, out.skipped = dict(recording.chosen), recording.duration_s, recording.skipped
+        if "odometry" not in recording.chosen:
+            raise InsufficientDataError("localization needs wheel odometry; name it with --topic-odometry")
+        if not {"points", "trunks"} & set(recording.chosen):
+            raise InsufficientDataError("no point cloud and no trunk detections; name one with --topic-points or --topic-trunks")
+        localizer: Localizer | None = None
+        buffer: list[Imu | Odometry] = []
+        stretch = _Stretch()
+        first_ns = 0
+        for m in stream(recording, config.trunks, lambda _, share: progress("localize", share)):
+            first_ns = first_ns or m.stamp_ns
+            since = (m.stamp_ns - first_ns) * 1e-9
+            if not until_s[0] <= since < until_s[1]:
+                continue
+            if isinstance(m, (Imu, Odometry)):
+                buffer.append(m)
+            elif isinstance(m, Trunks):
+                if localizer is None:
+                    localizer = _begin(topo, recording, buffer, config, method, out.notes)
+                began_one = time.perf_counter()
+                localizer.update(m, buffer)
+                out.update_ms.append(1e3 * (time.perf_counter() - began_one))
+                buffer.clear()
+                report = localizer.report
+                assert report is not None
+                out.reports.append(report)
+                out.distance.append((out.distance[-1] if out.distance else 0.0) + localizer.leg.distance)
+                if isinstance(localizer.method, GraphMethod):
+                    stretch.add(report, localizer.method)
+    out.seconds["read, detect and localize"] = time.perf_counter() - began
+    if localizer is None:
+        raise InsufficientDataError("no scan in the recording (or in the part that was asked for)")
+    if isinstance(localizer.method, ThesisMethod):
+        out.exploded = localizer.method.exploded
+    else:
+        began = time.perf_counter()
+        progress("smooth", 0.0)
+        out.smoothed = stretch.solve()
+        progress("smooth", 1.0)
+        out.seconds["smooth"] = time.perf_counter() - began
+    return out
+
+
+def _begin(
+    topo: TopoMap, recording: Recording, buffer: Sequence[Imu | Odometry], config: Config, method: str, notes: list[str]
+) -> Localizer:
+    """A localizer with the mountings that the recording knows."""
+    frames = {type(m): (m.frame if isinstance(m, Imu) else m.child_frame) for m in buffer}
+    child_T_robot = child_mount(recording, frames.get(Odometry, config.bags.base_frame), config, notes)
+    robot_R_imu = None
+    if Imu in frames:
+        mount = recording.frames.find(frames[Imu])
+        if mount is None:
+            notes.append(f"IMU frame {frames[Imu]!r} is not in TF: levelled by gravity at the start")
+        else:
+            robot_R_imu = mount[:3, :3]
+    else:
+        notes.append("no IMU: turns rest on the wheels, and the ground is taken as level")
+    other = ThesisMethod(topo, config.thesis) if method == "thesis" else None
+    return Localizer(topo, config.localize, child_T_robot=child_T_robot, robot_R_imu=robot_R_imu, method=other)
+
+
+@dataclass(slots=True)
+class _Scan:
+    """What the smoother needs of one committed scan."""
+
+    fix: Fix
+    move: Move
+    sweep: Sweep
+    pairs: NDArray[np.int64]
+
+
+class _Stretch:
+    """Committed stretches of a run, kept for the smoother."""
+
+    def __init__(self) -> None:
+        self.parts: list[list[_Scan]] = [[]]
+        self.method: GraphMethod | None = None
+
+    def add(self, report: Report, method: GraphMethod) -> None:
+        self.method = method
+        part = self.parts[-1]
+        if report.fix is None:
+            if part:
+                self.parts.append([])
+            return
+        if part:  # carried elsewhere: odometry does not join the two
+            jump = np.linalg.norm(report.fix.map_T_robot[:2, 3] - part[-1].fix.map_T_robot[:2, 3])
+            if jump > 1.0 + 3.0 * float(np.hypot(*method.move.step[:2])):
+                self.parts.append([])
+        self.parts[-1].append(_Scan(report.fix, method.move, method.sweep, method.sweep_pairs))
+
+    def solve(self) -> tuple[NDArray[np.int64], Array]:
+        """Stamps (K,) and poses (K, 4, 4) of all stretches."""
+        parts = [p for p in self.parts if p]
+        if not parts or self.method is None or self.method.engine is None:
+            return np.zeros(0, np.int64), np.zeros((0, 4, 4))
+        index = self.method.engine.index
+        var = index.var + self.method.config.map_sigma**2
+        poses = [
+            smooth([s.fix for s in p], [s.move for s in p], [s.sweep for s in p], [s.pairs for s in p], index.xy, var)
+            for p in parts
+        ]
+        return np.array([s.fix.stamp_ns for p in parts for s in p], np.int64), np.concatenate(poses)

@@ -1,0 +1,162 @@
+"""From bags to small streams and trunks, and single scans to draw."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from topograph.bags import Fix, Heading, Imu, Odometry, Recording, Scan, Trunks
+from topograph.config import Config
+from topograph.errors import InputError
+from topograph.geometry import Array, inverse
+from topograph.motion import Streams, StreamsBuilder, twist_during
+from topograph.trunks import TrunksConfig, from_recorded
+
+Progress = Callable[[str, float], None]
+
+
+def silent(stage: str, share: float) -> None:
+    """No progress shown."""
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What was read of a recording.
+
+    Attributes:
+        streams: the small streams.
+        trunks: trunks of each scan in `base_link`, in time order.
+        mounts: "imu", "fix", "heading" -> robot_T_sensor, or None where no transform is known.
+        chosen: stream kind -> topic.
+        skipped: reason -> count.
+        notes: what had to be assumed.
+        scans, seconds, duration_s: counted, spent reading and detecting, recorded.
+    """
+
+    streams: Streams
+    trunks: list[Trunks]
+    mounts: dict[str, Array | None]
+    child_T_robot: Array
+    chosen: dict[str, str]
+    skipped: Counter[str]
+    notes: list[str]
+    scans: int
+    seconds: float
+    duration_s: float
+
+
+def stream(
+    recording: Recording, config: TrunksConfig, progress: Progress = silent
+) -> Iterator[Trunks | Imu | Odometry | Fix | Heading]:
+    """The small messages as they come, and the trunks of each scan as soon as the motion during it is known."""
+    detect = _detector(recording, config)
+    builder = StreamsBuilder()
+    pending: list[Scan] = []
+    newest = 0
+    expected = max(1, sum(recording.counts[t] for t in recording.chosen.values()))
+    for n, (_, product) in enumerate(recording.messages()):
+        if n % 200 == 0:
+            progress("read", n / expected)
+        newest = max(newest, product.stamp_ns)
+        if isinstance(product, Scan):
+            pending.append(product)
+        elif isinstance(product, Trunks):
+            yield from_recorded(product, recording.frames.get(product.frame), config)
+        else:
+            builder.add(product)
+            yield product
+        while pending and newest > pending[0].stamp_ns + 250_000_000:
+            yield detect(pending.pop(0), builder)
+    for scan in pending:
+        yield detect(scan, builder)
+    progress("read", 1.0)
+
+
+def read_run(paths: Sequence[Path], config: Config, progress: Progress = silent) -> Run:
+    """Read a run once: small streams into arrays, scans into trunks as they come.
+
+    Raises:
+        InputError: nothing usable in the bags.
+        FrameError: the LiDAR's frame is not known.
+    """
+    began = time.perf_counter()
+    notes: list[str] = []
+    with Recording(paths, config.bags) as recording:
+        builder = StreamsBuilder()
+        trunks: list[Trunks] = []
+        for product in stream(recording, config.trunks, progress):
+            if isinstance(product, Trunks):
+                trunks.append(product)
+            else:
+                builder.add(product)
+        streams = builder.build(recording.skipped)
+        mounts: dict[str, Array | None] = {
+            k: recording.frames.find(streams.frames[k]) for k in ("imu", "fix", "heading") if k in streams.frames
+        }
+        for k, name in (("fix", "antenna"), ("heading", "heading")):
+            if k in mounts and mounts[k] is None:
+                notes.append(
+                    f"{name} frame {streams.frames[k]!r} is not in TF: taken at the base; "
+                    f"add --extrinsic {streams.frames[k]}=X,Y,Z,ROLL,PITCH,YAW"
+                )
+        child_T_robot = child_mount(recording, streams.frames.get("child", ""), config, notes)
+        skipped = recording.skipped
+        chosen, duration = dict(recording.chosen), recording.duration_s
+    return Run(
+        streams, trunks, mounts, child_T_robot, chosen, skipped, notes, len(trunks), time.perf_counter() - began, duration
+    )
+
+
+def child_mount(recording: Recording, child: str, config: Config, notes: list[str]) -> Array:
+    """`child_T_robot` (4, 4) of odometry's child frame; the identity, with a note, when TF does not know it."""
+    base_T_child = recording.frames.find(child)
+    if base_T_child is None:
+        notes.append(f"odometry's frame {child!r} is not in TF: taken as {config.bags.base_frame!r}")
+        base_T_child = np.eye(4)
+    return inverse(base_T_child)
+
+
+def _detector(recording: Recording, config: TrunksConfig) -> Callable[[Scan, StreamsBuilder], Trunks]:
+    """Scan -> trunks in the base's frame, deskewed with what the small streams said around the scan."""
+    from topograph.trunks.detector import Detector
+
+    detectors: dict[str, Detector] = {}
+
+    def detect(scan: Scan, streams: StreamsBuilder) -> Trunks:
+        if scan.frame not in detectors:
+            detectors[scan.frame] = Detector(recording.frames.get(scan.frame), config)
+        robot_R_imu = None
+        if streams.imu:
+            mount = recording.frames.find(streams.imu[0].frame)
+            robot_R_imu = None if mount is None else mount[:3, :3]
+        first, last = scan.stamp_ns, scan.stamp_ns
+        if scan.offset is not None and len(scan.offset):
+            first += int(np.nanmin(scan.offset) * 1e9)
+            last += int(np.nanmax(scan.offset) * 1e9)
+        twist, _ = twist_during(first, last, streams.odometry, streams.imu, robot_R_imu)
+        return detectors[scan.frame](scan, twist)
+
+    return detect
+
+
+def scan_near(
+    paths: Sequence[Path], config: Config, stamp_ns: int, trunks: Sequence[Trunks]
+) -> tuple[Scan, Array, Trunks]:
+    """The scan nearest to a stamp, the LiDAR's mounting, and the trunks found in it."""
+    with Recording(paths, config.bags) as recording:
+        best: Scan | None = None
+        for _, m in recording.messages(["points"]):
+            assert isinstance(m, Scan)
+            if best is None or abs(m.stamp_ns - stamp_ns) < abs(best.stamp_ns - stamp_ns):
+                best = m
+            elif m.stamp_ns > stamp_ns:
+                break
+        if best is None:
+            raise InputError("no point cloud to draw: the recording holds trunk detections only")
+        mount = recording.frames.get(best.frame)
+    return best, mount, min(trunks, key=lambda t: abs(t.stamp_ns - best.stamp_ns))

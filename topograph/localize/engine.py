@@ -80,9 +80,7 @@ class Engine:
         if self.track is None:
             self._look()
             if self.hunt.posterior.risk <= self.config.risk:
-                self._commit()
-                assert self.track is not None
-                return self._belief(self._pairs(self.track, sweep))
+                return self._belief(self._pairs(self._commit(), sweep))
             self._restart_when_stale()
             return self._belief(NO_PAIRS)
         pairs = self._follow(self.track, move, sweep)
@@ -135,7 +133,7 @@ class Engine:
         if h.submap.filter.run > 3.0 * self.config.forget and h.posterior.unknown > 0.5:
             self.hunt = _Hunt(Submap(self.config, self.visibility))
 
-    def _commit(self) -> None:
+    def _commit(self) -> Filter:
         h = self.hunt
         self.track = anchored(h, self.index, self.config)
         self.risk = h.posterior.risk
@@ -143,12 +141,13 @@ class Engine:
         self.sums[:] = 0.0
         self._matched_at = self.track.run
         self.hunt = _Hunt(Submap(self.config, self.visibility))
+        return self.track
 
     # -- tracking -------------------------------------------------------------------------------------------------
 
     def _follow(self, f: Filter, move: Move, sweep: Sweep) -> NDArray[np.int64]:
         """One scan of tracking; the pairs of trunks and mapped trees."""
-        c, index = self.config, self.index
+        c = self.config
         f.predict(move.step, move.cov, move.distance)
         near = np.hypot(*sweep.p.T) < c.view if len(sweep) else np.zeros(0, bool)
         z, R = sweep.p[near], sweep.cov[near] + c.trunk_sigma**2 * np.eye(2)
@@ -204,7 +203,7 @@ class Engine:
     def near(self, xy: Array, reach: float) -> NDArray[np.int64]:
         """Rows of mapped trees within `reach` of a place."""
         i = self.index
-        return _within(xy, reach, i.xy, i.origin, i.bucket, i.buckets, i.start, i.member)
+        return np.asarray(_within(xy, reach, i.xy, i.origin, i.bucket, i.buckets, i.start, i.member))
 
     def _suspect(
         self, f: Filter, z: Array, m2: Array, logdet: Array, match: NDArray[np.int64], found: NDArray[np.bool_],
@@ -309,8 +308,14 @@ def anchored(hunt: _Hunt, index: MapIndex, config: LocalizeConfig) -> Filter:
 def _within(at, reach, xy, origin, bucket, buckets, start, member):
     out = np.empty(64, np.int64)
     n = 0
-    x0, x1 = int(max(0.0, (at[0] - reach - origin[0]) / bucket)), int(min(buckets[0] - 1.0, (at[0] + reach - origin[0]) / bucket))
-    y0, y1 = int(max(0.0, (at[1] - reach - origin[1]) / bucket)), int(min(buckets[1] - 1.0, (at[1] + reach - origin[1]) / bucket))
+    x0, x1 = (
+        int(max(0.0, (at[0] - reach - origin[0]) / bucket)),
+        int(min(buckets[0] - 1.0, (at[0] + reach - origin[0]) / bucket)),
+    )
+    y0, y1 = (
+        int(max(0.0, (at[1] - reach - origin[1]) / bucket)),
+        int(min(buckets[1] - 1.0, (at[1] + reach - origin[1]) / bucket)),
+    )
     for bx in range(x0, x1 + 1):
         for by in range(y0, y1 + 1):
             cell = bx * buckets[1] + by

@@ -65,7 +65,9 @@ def describe(submap: Submap, index: MapIndex, config: LocalizeConfig) -> tuple[L
     f, c, v = submap.filter, config, submap.visibility
     rows = np.arange(f.n)
     if f.n > c.landmarks:
-        rows = np.sort(np.argsort(-(np.minimum(f.hits, 4.0) + 2.0 * f.hits / f.looks) + 0.02 * (f.run - f.seen))[: c.landmarks])
+        rows = np.sort(
+            np.argsort(-(np.minimum(f.hits, 4.0) + 2.0 * f.hits / f.looks) + 0.02 * (f.run - f.seen))[: c.landmarks]
+        )
     hits, looks = f.hits[rows], np.maximum(f.looks[rows], f.hits[rows])
     seen = _beta_binomial(hits, looks, 3.0 * 0.75, 3.0 * 0.25)
     passing = v.clutter(c.view) * np.maximum(looks, 1.0) * 0.05 ** (hits - 1)
@@ -129,7 +131,14 @@ def weigh(found: Found, marks: Landmarks, submap: Submap, index: MapIndex, confi
     rest = np.logaddexp(rest, dropped)
     total = np.logaddexp(np.logaddexp.reduce(placed), np.logaddexp(unknown, rest))
     return Posterior(
-        pose, np.exp(placed - total), float(np.exp(unknown - total)), float(np.exp(rest - total)), tree, scale, cov[0], placed
+        pose,
+        np.exp(placed - total),
+        float(np.exp(unknown - total)),
+        float(np.exp(rest - total)),
+        tree,
+        scale,
+        cov[0],
+        placed,
     )
 
 
@@ -163,7 +172,9 @@ def _chance(raster, felled):
 
 
 @njit(cache=True)
-def _match(c, s, x, y, m, var, tree, other, dia, dia_var, xy, tvar, tdia, dmean, dsd, origin, cell, nearest, base, seen, so):
+def _match(
+    c, s, x, y, m, var, tree, other, dia, dia_var, xy, tvar, tdia, dmean, dsd, origin, cell, nearest, base, seen, so
+):
     """Mapped tree of each landmark under one placement; each tree once."""
     n = len(m)
     out = np.full(n, -1, np.int64)
@@ -227,7 +238,27 @@ def _evidence(
         for turn in range(3):
             c, s = np.cos(yaw), np.sin(yaw)
             new = _match(
-                c, s, x, y, m, var, tree, other, dia, dia_var, xy, tvar, tdia, dmean, dsd, origin, cell, nearest, base, seen, so
+                c,
+                s,
+                x,
+                y,
+                m,
+                var,
+                tree,
+                other,
+                dia,
+                dia_var,
+                xy,
+                tvar,
+                tdia,
+                dmean,
+                dsd,
+                origin,
+                cell,
+                nearest,
+                base,
+                seen,
+                so,
             )
             if turn == 2 and np.all(new == ids):
                 break
@@ -335,8 +366,14 @@ def _views(x, y, yaw, ids, xy, origin, bucket, buckets, start, member, seen, so,
     c, s = np.cos(yaw), np.sin(yaw)
     cx, cy = x + c * centre[0] - s * centre[1], y + s * centre[0] + c * centre[1]
     total = 0.0
-    x0, x1 = int(max(0.0, (cx - reach - origin[0]) / bucket)), int(min(buckets[0] - 1.0, (cx + reach - origin[0]) / bucket))
-    y0, y1 = int(max(0.0, (cy - reach - origin[1]) / bucket)), int(min(buckets[1] - 1.0, (cy + reach - origin[1]) / bucket))
+    x0, x1 = (
+        int(max(0.0, (cx - reach - origin[0]) / bucket)),
+        int(min(buckets[0] - 1.0, (cx + reach - origin[0]) / bucket)),
+    )
+    y0, y1 = (
+        int(max(0.0, (cy - reach - origin[1]) / bucket)),
+        int(min(buckets[1] - 1.0, (cy + reach - origin[1]) / bucket)),
+    )
     for bx in range(x0, x1 + 1):
         for by in range(y0, y1 + 1):
             at = bx * buckets[1] + by

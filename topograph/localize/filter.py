@@ -83,7 +83,8 @@ class Filter:
 
     def innovations(self, z: Array, R: Array) -> tuple[Array, Array]:
         """Squared Mahalanobis distances (N, n) of detections to landmarks, and log determinants of their S (N, n)."""
-        return _innovations(self._mean, self._cov, self.n, z, R)
+        m2, logdet = _innovations(self._mean, self._cov, self.n, z, R)
+        return m2, logdet
 
     def update(self, k: int, z: Array, R: Array) -> tuple[float, float]:
         """Sight landmark `k` at `z` (2,) in the robot's plane; returns chi-square and log |S| of the innovation."""

@@ -65,7 +65,7 @@ def build_index(xy: Array, var: Array, diameter: Array, view: float, longest: fl
     """
     tree = cKDTree(xy)
     n = len(xy)
-    gap = float(np.median(tree.query(xy, min(2, n))[0][:, -1])) if n > 1 else 5.0
+    gap = float(np.median(np.asarray(tree.query(xy, min(2, n))[0])[:, -1])) if n > 1 else 5.0
     cell = float(np.clip(0.25 * gap, 0.25, 1.0))
     low, high = xy.min(0) - 2.0, xy.max(0) + 2.0
     while np.prod((high - low) / cell) > max(4e6, 100.0 * n):  # far islands of trees: a coarser raster
@@ -89,7 +89,9 @@ def build_index(xy: Array, var: Array, diameter: Array, view: float, longest: fl
     length = np.linalg.norm(xy[pairs[:, 0]] - xy[pairs[:, 1]], axis=1) if len(pairs) else np.zeros(0)
     by_length = np.argsort(length)
     ok = np.isfinite(diameter)
-    area = float(np.prod(high - low + 10.0)) if len(covered) * 100.0 > 0.3 * np.prod(high - low) else len(covered) * 400.0
+    area = (
+        float(np.prod(high - low + 10.0)) if len(covered) * 100.0 > 0.3 * np.prod(high - low) else len(covered) * 400.0
+    )
     return MapIndex(
         xy, var, diameter, low, cell, nearest, bucket, buckets, start, order,
         length[by_length].astype(np.float32), pairs[by_length, 0].astype(np.int32), pairs[by_length, 1].astype(np.int32),
@@ -132,9 +134,9 @@ def _jitter(tree: cKDTree, xy: Array, var: Array, gap: float, sample: int = 2000
     if n < 5:
         return 0.25 * gap
     rows = np.random.default_rng(0).permutation(n)[:sample]
-    _, near = tree.query(xy[rows], min(5, n))
+    near = np.asarray(tree.query(xy[rows], min(5, n))[1])
     mirror = (2 * xy[rows, None] - xy[near[:, 1:]]).reshape(-1, 2)
-    d, third = tree.query(mirror)
+    d = np.asarray(tree.query(mirror)[0])
     inside = d < 0.45 * gap  # farther: a border or a gap, or no lattice at all
     if inside.mean() < 0.25:
         return 0.25 * gap

@@ -63,7 +63,9 @@ class Localizer:
         if isinstance(scan, Scan):
             if self._detect is None:
                 raise TypeError("a Localizer that is fed scans needs `detect`")
-            last = scan.stamp_ns + (0 if scan.offset is None or not len(scan.offset) else int(np.nanmax(scan.offset) * 1e9))
+            last = scan.stamp_ns + (
+                0 if scan.offset is None or not len(scan.offset) else int(np.nanmax(scan.offset) * 1e9)
+            )
             twist, _ = twist_during(scan.stamp_ns, last, self._recent_odometry, self._recent_imu, self._robot_R_imu)
             scan = self._detect(scan, twist)
         del self._recent_odometry[:-200], self._recent_imu[:-500]

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from topograph.geometry import Array
 from topograph.localize.config import LocalizeConfig
@@ -72,10 +71,10 @@ def search(marks: Landmarks, index: MapIndex, config: LocalizeConfig) -> Found:
     pairs = _anchors(marks, index, config)
     poses: list[Array] = []
     losses: list[Array] = []
-    best, seeds, missed, used = np.inf, 0, 1.0, 0
+    best, seeds, missed = np.inf, 0, 1.0
     order_all = np.argsort(marks.var - 0.02 * marks.lasting)
     typical = -float(np.sum(marks.other - marks.tree))
-    for i, j, p_both, low, high in pairs:
+    for used, (i, j, p_both, low, high) in enumerate(pairs):
         if missed < config.anchors and (best < 0.5 * typical or used >= 6):
             break
         order = np.concatenate([[i, j], order_all[(order_all != i) & (order_all != j)]]).astype(np.int64)
@@ -88,7 +87,6 @@ def search(marks: Landmarks, index: MapIndex, config: LocalizeConfig) -> Found:
         losses.append(loss)
         seeds += 2 * (high - low)
         missed *= 1.0 - p_both
-        used += 1
     if not poses:
         return Found(np.zeros((0, 3)), np.zeros(0), 0.0, 0)
     pose, loss = np.concatenate(poses), np.concatenate(losses)
@@ -134,7 +132,8 @@ def _anchors(marks: Landmarks, index: MapIndex, config: LocalizeConfig) -> list[
     # Long pairs hold the heading; many candidates cost time.
     value = np.log(np.maximum(both, 1e-9)) + 0.1 * np.log(length + 1) - 0.08 * np.log(high - low + 1.0)
     value[~usable] = -np.inf
-    out, busy = [], np.zeros(n, np.int64)
+    out: list[tuple[int, int, float, int, int]] = []
+    busy = np.zeros(n, np.int64)
     for limit in (1, 2, 4):
         for k in np.argsort(-value):
             if not np.isfinite(value[k]):
@@ -148,7 +147,27 @@ def _anchors(marks: Landmarks, index: MapIndex, config: LocalizeConfig) -> list[
 
 
 @njit(cache=True)
-def _seed(m, var, dia, dia_var, other, order, pa, pb, xy, tvar, tdia, dmean, dsd, origin, cell, nearest, best, bound, map_sigma):
+def _seed(
+    m,
+    var,
+    dia,
+    dia_var,
+    other,
+    order,
+    pa,
+    pb,
+    xy,
+    tvar,
+    tdia,
+    dmean,
+    dsd,
+    origin,
+    cell,
+    nearest,
+    best,
+    bound,
+    map_sigma,
+):
     n = len(m)
     out = np.empty((1024, 3))
     losses = np.empty(1024)

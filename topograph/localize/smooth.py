@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from topograph.geometry import Array, from_xyz_rpy, yaw_of
 from topograph.localize.method import Fix
@@ -15,7 +16,12 @@ _X, _L = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
 
 
 def smooth(
-    fixes: Sequence[Fix], moves: Sequence[Move], sweeps: Sequence[Sweep], pairs: Sequence[Array], trees: Array, var: Array
+    fixes: Sequence[Fix],
+    moves: Sequence[Move],
+    sweeps: Sequence[Sweep],
+    pairs: Sequence[NDArray[np.int64]],
+    trees: Array,
+    var: Array,
 ) -> Array:
     """Poses (K, 4, 4) of a stretch of K committed fixes, by a planar graph of odometry and known landmarks.
 
@@ -39,7 +45,11 @@ def smooth(
             if t not in known:
                 known.add(t)
                 values.insert(_L(t), trees[t])
-                graph.add(gtsam.PriorFactorPoint2(_L(t), trees[t], gtsam.noiseModel.Isotropic.Sigma(2, float(np.sqrt(var[t])))))
+                graph.add(
+                    gtsam.PriorFactorPoint2(
+                        _L(t), trees[t], gtsam.noiseModel.Isotropic.Sigma(2, float(np.sqrt(var[t])))
+                    )
+                )
             p, C = sweeps[k].p[i], sweeps[k].cov[i]
             reach = float(np.hypot(*p))
             line = p / reach
@@ -66,4 +76,4 @@ def _to_pose2(cov: Array, yaw: float) -> Array:
     c, s = np.cos(yaw), np.sin(yaw)
     R = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
     picked = cov[np.ix_([3, 4, 2], [3, 4, 2])]
-    return R @ picked @ R.T + 1e-9 * np.eye(3)
+    return np.asarray(R @ picked @ R.T + 1e-9 * np.eye(3))

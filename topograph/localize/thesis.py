@@ -80,7 +80,9 @@ class ThesisMethod:
             clouds = [trunks.clouds[i] if trunks.clouds else None for i in use]
             z = flat[use, :2]
             candidates = [self._by_icp(c, n) for c, n in zip(clouds, self._by_distance(z), strict=True)]
-            measured = np.array([multilaterate(z, self.nodes[list(c)]) for c in self._combine(z, candidates)]).reshape(-1, 3)
+            measured = np.array([multilaterate(z, self.nodes[list(c)]) for c in self._combine(z, candidates)]).reshape(
+                -1, 3
+            )
         self._update(measured, leg)
         n = len(self.poses)
         fix = None
@@ -93,7 +95,9 @@ class ThesisMethod:
         if not n:
             self.started = False
         none = np.zeros(0, np.int64)
-        return Report(trunks.stamp_ns, state, fix, n, np.nan, self.poses[:200], none, np.zeros((0, 2), np.int64), np.nan, np.nan)
+        return Report(
+            trunks.stamp_ns, state, fix, n, np.nan, self.poses[:200], none, np.zeros((0, 2), np.int64), np.nan, np.nan
+        )
 
     def _by_distance(self, z: Array) -> list[NDArray[np.int64]]:
         """Algorithm 4: candidate nodes of each trunk."""
@@ -105,7 +109,9 @@ class ThesisMethod:
             for j in range(n):
                 if i == j:
                     continue
-                low, high = np.searchsorted(self.length, [d[i, j] - self.config.distance, d[i, j] + self.config.distance])
+                low, high = np.searchsorted(
+                    self.length, [d[i, j] - self.config.distance, d[i, j] + self.config.distance]
+                )
                 nodes = np.unique(self.edges[low:high])
                 common = nodes if common is None else np.intersect1d(common, nodes, assume_unique=True)
             out.append(np.zeros(0, np.int64) if common is None else common)

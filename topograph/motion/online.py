@@ -44,7 +44,9 @@ class Reckoner:
     axes, None: the tilt is taken from gravity at the start, which is enough for turns.
     """
 
-    def __init__(self, child_T_robot: Array | None = None, robot_R_imu: Array | None = None, tilt_time_s: float = 4.0) -> None:
+    def __init__(
+        self, child_T_robot: Array | None = None, robot_R_imu: Array | None = None, tilt_time_s: float = 4.0
+    ) -> None:
         self.child_T_robot = np.eye(4) if child_T_robot is None else child_T_robot
         self.robot_R_imu = robot_R_imu
         self.tilt_time_s = tilt_time_s

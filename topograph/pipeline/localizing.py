@@ -70,7 +70,9 @@ def localize_bags(
         if "odometry" not in recording.chosen:
             raise InsufficientDataError("localization needs wheel odometry; name it with --topic-odometry")
         if not {"points", "trunks"} & set(recording.chosen):
-            raise InsufficientDataError("no point cloud and no trunk detections; name one with --topic-points or --topic-trunks")
+            raise InsufficientDataError(
+                "no point cloud and no trunk detections; name one with --topic-points or --topic-trunks"
+            )
         localizer: Localizer | None = None
         buffer: list[Imu | Odometry] = []
         stretch = _Stretch()

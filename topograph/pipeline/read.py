@@ -108,7 +108,16 @@ def read_run(paths: Sequence[Path], config: Config, progress: Progress = silent)
         skipped = recording.skipped
         chosen, duration = dict(recording.chosen), recording.duration_s
     return Run(
-        streams, trunks, mounts, child_T_robot, chosen, skipped, notes, len(trunks), time.perf_counter() - began, duration
+        streams,
+        trunks,
+        mounts,
+        child_T_robot,
+        chosen,
+        skipped,
+        notes,
+        len(trunks),
+        time.perf_counter() - began,
+        duration,
     )
 
 

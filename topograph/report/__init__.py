@@ -7,11 +7,14 @@ from topograph.report.figures import (
     scan_figure,
     tree_error_figure,
 )
+from topograph.report.localization import localization_error_figure, localization_figure
 from topograph.report.page import write_page
 from topograph.report.record import write_json
 
 __all__ = [
     "comparison_figure",
+    "localization_error_figure",
+    "localization_figure",
     "map_figure",
     "residual_figure",
     "scan_figure",

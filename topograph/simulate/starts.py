@@ -63,7 +63,15 @@ SCENARIOS: dict[str, StartsConfig] = {
     "Fo": StartsConfig(layout="irregular", spacing=7.0, row_spacing=6.06, jitter=1.0, gaps=0.12, view=8.0, miss=0.3),
     "G": StartsConfig(jitter=0.05, view=25.0, sigma=0.10),
     "T": StartsConfig(
-        layout="irregular", trees=24, spacing=7.0, row_spacing=6.06, jitter=1.0, gaps=0.12, view=8.0, sigma=0.10, map_sigma=0.05
+        layout="irregular",
+        trees=24,
+        spacing=7.0,
+        row_spacing=6.06,
+        jitter=1.0,
+        gaps=0.12,
+        view=8.0,
+        sigma=0.10,
+        map_sigma=0.05,
     ),
 }
 
@@ -176,7 +184,9 @@ def _steer(pose: Array, goal: Array, tree: cKDTree, rng: np.random.Generator) ->
     return float(np.clip(0.5 * turn, -0.4, 0.4) + rng.normal(0, 0.05))
 
 
-def _scan(w: World, tree: cKDTree, pose: Array, c: StartsConfig, rng: np.random.Generator) -> tuple[Array, Array, Array]:
+def _scan(
+    w: World, tree: cKDTree, pose: Array, c: StartsConfig, rng: np.random.Generator
+) -> tuple[Array, Array, Array]:
     rows = np.array(tree.query_ball_point(pose[:2], c.view), dtype=int)
     d = w.trees[rows] - pose[:2]
     cs, sn = np.cos(pose[2]), np.sin(pose[2])

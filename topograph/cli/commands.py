@@ -1,178 +1,30 @@
-"""Words -> pipeline -> report. The only place that prints and exits."""
+"""The commands: words -> pipeline -> report."""
 
 from __future__ import annotations
 
-import hashlib
-import logging
-import os
-import platform
-import resource
-import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 import numpy as np
 
 from topograph import __version__
-from topograph.errors import InputError, TopographError, UsageError
-
-_F = TypeVar("_F", bound=Callable[..., Any])
-
-_TOPICS = ("points", "trunks", "odometry", "imu", "fix", "heading")
-
-
-class _Group(click.Group):
-    """Turns errors into one line on stderr and their exit code."""
-
-    def invoke(self, ctx: click.Context) -> Any:
-        try:
-            return super().invoke(ctx)
-        except TopographError as err:
-            click.echo(f"topograph: {err}", err=True)
-            ctx.exit(err.exit_code)
-        except BrokenPipeError:
-            os._exit(0)
-
-
-@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
-@click.version_option(__version__)
-@click.option("-v", "--verbose", is_flag=True, help="Say what happens inside.")
-def main(verbose: bool) -> None:
-    """Topological maps of orchards from robot recordings, by factor graph."""
-    logging.basicConfig(level=logging.DEBUG if verbose else logging.ERROR, format="%(name)s: %(message)s")
-    if not verbose:
-        logging.getLogger("topograph").setLevel(logging.WARNING)
-
-
-def _input_options(f: _F) -> _F:
-    for kind in reversed(_TOPICS):
-        f = click.option(f"--topic-{kind}", default=None, metavar="TOPIC", help=f"Topic of {kind}; 'none' ignores it.")(
-            f
-        )
-    f = click.option("--base-frame", default=None, help="Frame whose poses are estimated (base_link).")(f)
-    f = click.option(
-        "--extrinsic", multiple=True, metavar="FRAME=X,Y,Z,R,P,Y",
-        help="Mounting of a sensor in the base frame, metres and radians; repeat for more.",
-    )(f)  # fmt: skip
-    return click.option(
-        "-c", "--config", "config_file", type=click.Path(path_type=Path), help="YAML of `topograph config`."
-    )(f)
-
-
-def _config(config_file: Path | None, words: dict[str, Any]) -> Any:
-    from topograph.config import load
-
-    overrides: dict[str, Any] = {}
-    for kind in _TOPICS:
-        if words.get(f"topic_{kind}"):
-            overrides[f"bags.topic_{kind}"] = words[f"topic_{kind}"]
-    if words.get("base_frame"):
-        overrides["bags.base_frame"] = words["base_frame"]
-    mounts = {}
-    for word in words.get("extrinsic") or ():
-        frame, _, numbers = word.partition("=")
-        try:
-            values = tuple(float(x) for x in numbers.split(","))
-        except ValueError:
-            values = ()
-        if len(values) != 6 or not frame:
-            raise UsageError(f"--extrinsic {word}: give FRAME=X,Y,Z,ROLL,PITCH,YAW, metres and radians")
-        mounts[frame] = values
-    if mounts:
-        overrides["bags.extrinsics"] = mounts
-    return load(config_file, overrides)
-
-
-@contextmanager
-def _progress(quiet: bool) -> Iterator[Callable[[str, float], None]]:
-    """A bar with rate and time left on a terminal; a line per stage elsewhere."""
-    if quiet or not sys.stderr.isatty():
-        said: dict[str, int] = {}
-        began = time.monotonic()
-
-        def plain(stage: str, share: float) -> None:
-            step = int(4 * share)
-            if not quiet and said.get(stage, -1) < step:
-                said[stage] = step
-                click.echo(f"{stage}: {100 * share:.0f} % ({time.monotonic() - began:.0f} s)", err=True)
-
-        yield plain
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description:>16}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"),
-               TimeElapsedColumn(), TimeRemainingColumn())  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        tasks: dict[str, Any] = {}
-
-        def show(stage: str, share: float) -> None:
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=1.0)
-            bar.update(tasks[stage], completed=share)
-
-        yield show
-
-
-def _results(folder: Path | None) -> Path:
-    """The folder for a run's results; without a name results/<stamp>, and `latest` points there."""
-    if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        return folder
-    root = Path("results")
-    out = root / datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S_%f")
-    out.mkdir(parents=True)
-    link = root / "latest"
-    part = root / f".latest.{os.getpid()}"
-    part.unlink(missing_ok=True)
-    part.symlink_to(out.name)
-    part.replace(link)
-    return out
-
-
-def _hash(path: Path) -> str:
-    """SHA-256 of a file, or of a folder's files in order of name."""
-    h = hashlib.sha256()
-    for p in [path] if path.is_file() else sorted(q for q in path.rglob("*") if q.is_file()):
-        with p.open("rb") as f:
-            while block := f.read(1 << 22):
-                h.update(block)
-    return h.hexdigest()
-
-
-def _versions() -> dict[str, str]:
-    names = ("gtsam", "numpy", "scipy", "numba", "rosbags")
-    return {
-        "topograph": __version__,
-        "python": platform.python_version(),
-        **{n: metadata.version(n) for n in names},
-    }
-
-
-def _peak_mb() -> float:
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 1024 if sys.platform != "darwin" else peak / 1024**2
-
-
-def _truth(folder: Path | None) -> Any:
-    """The truth that was named; none is looked for: an estimator must not find it by itself."""
-    from topograph.evaluate import Truth
-
-    return None if folder is None else Truth.load(folder)
-
-
-def _table(metrics: Sequence[Any]) -> None:
-    from topograph.report.page import show
-
-    for m in metrics:
-        click.echo(f"  {m.name:<38} {show(m):>12}")
+from topograph.cli.common import (
+    config_of,
+    hash_of,
+    input_options,
+    main,
+    peak_mb,
+    progress_bar,
+    results_folder,
+    table,
+    truth_of,
+    versions,
+)
+from topograph.errors import InputError, UsageError
 
 
 @main.command("map")
@@ -184,7 +36,7 @@ def _table(metrics: Sequence[Any]) -> None:
 @click.option("--check-fixes", type=click.IntRange(0), default=0, metavar="N",
               help="Withhold every N-th fix from the estimator and report the path's distance from it (1: withhold all).")  # fmt: skip
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
-@_input_options
+@input_options
 def map_command(
     bags: tuple[Path, ...], output: Path | None, into: Path | None, results: Path | None, truth: Path | None,
     check_fixes: int, quiet: bool, config_file: Path | None, **words: Any,
@@ -194,14 +46,14 @@ def map_command(
 
     if output is not None and into is not None:
         raise UsageError("-o makes a new map, --into extends one: give one of them")
-    config = _config(config_file, words)
-    true = _truth(truth)
+    config = config_of(config_file, words)
+    true = truth_of(truth)
     old = None if into is None else store.load(into)
-    folder = _results(results)
+    folder = results_folder(results)
     target = into or output or folder / "map.gpkg"
     if target.suffix != ".gpkg":
         raise UsageError(f"{target}: a map is a GeoPackage; end its name in .gpkg")
-    with _progress(quiet) as progress:
+    with progress_bar(quiet) as progress:
         run = pipeline.read_run(bags, config, progress)
         solved = pipeline.solve_run(run, config, check_fixes=check_fixes, known=old, progress=progress)
         topo = _save_results(solved, config, bags, folder, target, true, old, progress)
@@ -229,9 +81,9 @@ def _save_results(
     from topograph.report.record import write_text
 
     began = time.perf_counter()
-    inputs = [{"path": p.name, "sha256": _hash(p)} for p in bags]
+    inputs = [{"path": p.name, "sha256": hash_of(p)} for p in bags]
     text = dump(config)
-    meta = {"config": text, "inputs": json.dumps(inputs), "versions": json.dumps(_versions())}
+    meta = {"config": text, "inputs": json.dumps(inputs), "versions": json.dumps(versions())}
     progress("map", 0.0)
     topo = pipeline.topo_map(solved, config, meta)
     if old is not None:
@@ -265,7 +117,7 @@ def _save_results(
     if solved.problem.n_trees:
         store.save(topo, target)
     report.write_json(
-        folder / "report.json", metrics, solved.run.skipped, inputs, seconds, _peak_mb(), notes=notes, versions=_versions(),
+        folder / "report.json", metrics, solved.run.skipped, inputs, seconds, peak_mb(), notes=notes, versions=versions(),
         topics=solved.run.chosen, scales=solved.estimate.scales,
     )  # fmt: skip
     report.write_page(
@@ -281,7 +133,7 @@ def _save_results(
 @click.option("--truth", type=click.Path(path_type=Path), help="Folder of simulated truth to compare with.")
 @click.option("--results", type=click.Path(path_type=Path), help="Folder for the figure and report.json.")
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
-@_input_options
+@input_options
 def compare(
     bags: tuple[Path, ...],
     truth: Path | None,
@@ -296,10 +148,10 @@ def compare(
     from topograph.evaluate.metrics import doubles, tree_errors
     from topograph.report.page import show
 
-    config = _config(config_file, words)
-    true = _truth(truth)
-    folder = _results(results)
-    with _progress(quiet) as progress:
+    config = config_of(config_file, words)
+    true = truth_of(truth)
+    folder = results_folder(results)
+    with progress_bar(quiet) as progress:
         run = pipeline.read_run(bags, config, progress)
         solved = pipeline.solve_run(run, config, progress=progress)
         ours = pipeline.topo_map(solved, config, {})
@@ -321,20 +173,20 @@ def compare(
         (folder / "comparison.png").write_bytes(report.comparison_figure(errors))
     flat = [replace(m, name=f"{k}: {m.name}") for k, ms in rows.items() for m in ms]
     report.write_json(
-        folder / "report.json", flat, run.skipped, [{"path": p.name, "sha256": _hash(p)} for p in bags],
-        solved.seconds, _peak_mb(), notes=run.notes, versions=_versions(),
+        folder / "report.json", flat, run.skipped, [{"path": p.name, "sha256": hash_of(p)} for p in bags],
+        solved.seconds, peak_mb(), notes=run.notes, versions=versions(),
     )  # fmt: skip
     click.echo(f"written: {folder}")
 
 
 @main.command()
 @click.argument("bags", nargs=-1, required=True, type=click.Path(path_type=Path))
-@_input_options
+@input_options
 def inspect(bags: tuple[Path, ...], config_file: Path | None, **words: Any) -> None:
     """Say what BAGS hold: topics, types, counts, which stream is taken for what, sensor frames."""
     from topograph.bags import Recording, topics
 
-    config = _config(config_file, words)
+    config = config_of(config_file, words)
     try:
         recording = Recording(bags, config.bags)
         with recording:
@@ -367,7 +219,7 @@ def inspect(bags: tuple[Path, ...], config_file: Path | None, **words: Any) -> N
 )
 @click.option("--results", type=click.Path(path_type=Path), help="Folder for report.json.")
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
-@_input_options
+@input_options
 def detect(
     bags: tuple[Path, ...], csv_file: Path | None, picture: Path | None, at_s: float | None, truth: Path | None,
     results: Path | None, quiet: bool, config_file: Path | None, **words: Any,
@@ -378,9 +230,9 @@ def detect(
     from topograph.geometry import inverse, transform
     from topograph.report.record import write_text
 
-    config = _config(config_file, words)
-    true = _truth(truth)
-    with _progress(quiet) as progress:
+    config = config_of(config_file, words)
+    true = truth_of(truth)
+    with progress_bar(quiet) as progress:
         run = pipeline.read_run(bags, config, progress)
     if run.scans == 0:
         raise InputError("no point cloud and no trunk detections; name a topic with --topic-points or --topic-trunks")
@@ -429,14 +281,14 @@ def detect(
         picture.write_bytes(report.scan_figure(scan, mount, shown, feet))
     if results is not None:
         results.mkdir(parents=True, exist_ok=True)
-        inputs = [{"path": p.name, "sha256": _hash(p)} for p in bags]
+        inputs = [{"path": p.name, "sha256": hash_of(p)} for p in bags]
         report.write_json(
             results / "report.json",
             metrics,
             run.skipped,
             inputs,
             {"read": run.seconds},
-            _peak_mb(),
+            peak_mb(),
             notes=run.notes,
         )
 
@@ -471,7 +323,7 @@ def simulate(
         gnss=gnss, rings=int(rings), sweep_hz=sweep_hz, detections=detections, compression=compression
     )
     drive = DriveConfig(run=number, stop_every=stop_every, longest_s=longest, laps=laps)
-    with _progress(quiet) as progress:
+    with progress_bar(quiet) as progress:
         truth = record(output, seed, design, drive, sensor, progress=lambda share: progress("simulate", share))
     span = (truth.stamps_ns[-1] - truth.stamps_ns[0]) * 1e-9
     click.echo(f"{output}: {span:.0f} s, {len(truth.trees)} trees; truth in {output.with_name(output.stem + '.truth')}")
@@ -493,7 +345,7 @@ def demo(folder: Path, seed: int, quiet: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for old in (bag, folder / "run1.truth"):
         shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
-    with _progress(quiet) as progress:
+    with progress_bar(quiet) as progress:
         truth = record(
             bag, seed, "olive", DriveConfig(run=1), SensorConfig(sweep_hz=10.0, columns=1808),
             progress=lambda share: progress("simulate", share),
@@ -504,7 +356,7 @@ def demo(folder: Path, seed: int, quiet: bool) -> None:
         topo = _save_results(solved, config, [bag], folder, folder / "orchard.gpkg", truth, None, progress)
     from topograph.evaluate import map_metrics
 
-    _table(map_metrics(topo, truth))
+    table(map_metrics(topo, truth))
     click.echo(f"look at {folder / 'report.html'} (browser), {folder / 'orchard.gpkg'} (QGIS), {folder / 'map.png'}")
 
 
@@ -548,7 +400,3 @@ def config_command(config_file: Path | None) -> None:
     from topograph.config import dump, load
 
     click.echo(dump(load(config_file)), nl=False)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,173 @@
+"""What all commands share: errors to exit codes, input options, progress, results' folder."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import platform
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from topograph import __version__
+from topograph.errors import TopographError, UsageError
+
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+_TOPICS = ("points", "trunks", "odometry", "imu", "fix", "heading")
+
+
+class _Group(click.Group):
+    """Turns errors into one line on stderr and their exit code."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except TopographError as err:
+            click.echo(f"topograph: {err}", err=True)
+            ctx.exit(err.exit_code)
+        except BrokenPipeError:
+            os._exit(0)
+
+
+@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__)
+@click.option("-v", "--verbose", is_flag=True, help="Say what happens inside.")
+def main(verbose: bool) -> None:
+    """Topological maps of orchards from robot recordings, by factor graph."""
+    logging.basicConfig(level=logging.DEBUG if verbose else logging.ERROR, format="%(name)s: %(message)s")
+    if not verbose:
+        logging.getLogger("topograph").setLevel(logging.WARNING)
+
+
+def input_options(f: _F) -> _F:
+    for kind in reversed(_TOPICS):
+        f = click.option(f"--topic-{kind}", default=None, metavar="TOPIC", help=f"Topic of {kind}; 'none' ignores it.")(
+            f
+        )
+    f = click.option("--base-frame", default=None, help="Frame whose poses are estimated (base_link).")(f)
+    f = click.option(
+        "--extrinsic", multiple=True, metavar="FRAME=X,Y,Z,R,P,Y",
+        help="Mounting of a sensor in the base frame, metres and radians; repeat for more.",
+    )(f)  # fmt: skip
+    return click.option(
+        "-c", "--config", "config_file", type=click.Path(path_type=Path), help="YAML of `topograph config`."
+    )(f)
+
+
+def config_of(config_file: Path | None, words: dict[str, Any]) -> Any:
+    from topograph.config import load
+
+    overrides: dict[str, Any] = {}
+    for kind in _TOPICS:
+        if words.get(f"topic_{kind}"):
+            overrides[f"bags.topic_{kind}"] = words[f"topic_{kind}"]
+    if words.get("base_frame"):
+        overrides["bags.base_frame"] = words["base_frame"]
+    mounts = {}
+    for word in words.get("extrinsic") or ():
+        frame, _, numbers = word.partition("=")
+        try:
+            values = tuple(float(x) for x in numbers.split(","))
+        except ValueError:
+            values = ()
+        if len(values) != 6 or not frame:
+            raise UsageError(f"--extrinsic {word}: give FRAME=X,Y,Z,ROLL,PITCH,YAW, metres and radians")
+        mounts[frame] = values
+    if mounts:
+        overrides["bags.extrinsics"] = mounts
+    return load(config_file, overrides)
+
+
+@contextmanager
+def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
+    """A bar with rate and time left on a terminal; a line per stage elsewhere."""
+    if quiet or not sys.stderr.isatty():
+        said: dict[str, int] = {}
+        began = time.monotonic()
+
+        def plain(stage: str, share: float) -> None:
+            step = int(4 * share)
+            if not quiet and said.get(stage, -1) < step:
+                said[stage] = step
+                click.echo(f"{stage}: {100 * share:.0f} % ({time.monotonic() - began:.0f} s)", err=True)
+
+        yield plain
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description:>16}"), BarColumn(), TextColumn("{task.percentage:>3.0f} %"),
+               TimeElapsedColumn(), TimeRemainingColumn())  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        tasks: dict[str, Any] = {}
+
+        def show(stage: str, share: float) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=1.0)
+            bar.update(tasks[stage], completed=share)
+
+        yield show
+
+
+def results_folder(folder: Path | None) -> Path:
+    """The folder for a run's results; without a name results/<stamp>, and `latest` points there."""
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+    root = Path("results")
+    out = root / datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S_%f")
+    out.mkdir(parents=True)
+    link = root / "latest"
+    part = root / f".latest.{os.getpid()}"
+    part.unlink(missing_ok=True)
+    part.symlink_to(out.name)
+    part.replace(link)
+    return out
+
+
+def hash_of(path: Path) -> str:
+    """SHA-256 of a file, or of a folder's files in order of name."""
+    h = hashlib.sha256()
+    for p in [path] if path.is_file() else sorted(q for q in path.rglob("*") if q.is_file()):
+        with p.open("rb") as f:
+            while block := f.read(1 << 22):
+                h.update(block)
+    return h.hexdigest()
+
+
+def versions() -> dict[str, str]:
+    names = ("gtsam", "numpy", "scipy", "numba", "rosbags")
+    return {
+        "topograph": __version__,
+        "python": platform.python_version(),
+        **{n: metadata.version(n) for n in names},
+    }
+
+
+def peak_mb() -> float:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1024 if sys.platform != "darwin" else peak / 1024**2
+
+
+def truth_of(folder: Path | None) -> Any:
+    """The truth that was named; none is looked for: an estimator must not find it by itself."""
+    from topograph.evaluate import Truth
+
+    return None if folder is None else Truth.load(folder)
+
+
+def table(metrics: Sequence[Any]) -> None:
+    from topograph.report.page import show
+
+    for m in metrics:
+        click.echo(f"  {m.name:<38} {show(m):>12}")

@@ -1,0 +1,127 @@
+"""`topograph localize`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from topograph import __version__
+from topograph.cli.common import (
+    config_of,
+    hash_of,
+    input_options,
+    main,
+    peak_mb,
+    progress_bar,
+    results_folder,
+    table,
+    truth_of,
+    versions,
+)
+from topograph.errors import UsageError
+
+
+@main.command()
+@click.argument("map_file", metavar="MAP", type=click.Path(path_type=Path))
+@click.argument("bags", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--method", type=click.Choice(["graph", "thesis"]), default="graph", show_default=True,
+              help="graph: submap, evidence, track; thesis: Algorithms 4-6, to compare with.")  # fmt: skip
+@click.option(
+    "--risk", type=click.FloatRange(1e-9, 0.5), default=None, help="Chance of a wrong pose that is accepted (1e-4)."
+)
+@click.option("--from", "from_s", type=float, default=0.0, help="Begin so many seconds into the recording.")
+@click.option("--to", "to_s", type=float, default=float("inf"), help="End there.")
+@click.option("--results", type=click.Path(path_type=Path), help="Folder for poses, table, report and configuration.")
+@click.option("--truth", type=click.Path(path_type=Path), help="Folder of simulated truth to compare with.")
+@click.option("-q", "--quiet", is_flag=True, help="No progress.")
+@input_options
+def localize(
+    map_file: Path, bags: tuple[Path, ...], method: str, risk: float | None, from_s: float, to_s: float, results: Path | None,
+    truth: Path | None, quiet: bool, config_file: Path | None, **words: Any,
+) -> None:  # fmt: skip
+    """Find the robot of BAGS (one run) in MAP, from anywhere, without GNSS; no pose is given where it is not sure."""
+    from topograph import pipeline, store
+    from topograph.config import dump
+    from topograph.evaluate import write_tum
+    from topograph.evaluate.localization import localization_errors, localization_metrics
+    from topograph.report import localization_error_figure, localization_figure, write_json, write_page
+    from topograph.report.record import write_text
+
+    if from_s >= to_s:
+        raise UsageError(f"--from {from_s} --to {to_s}: nothing lies between")
+    config = config_of(config_file, words)
+    if risk is not None:
+        config = replace(config, localize=replace(config.localize, risk=risk))
+    true = truth_of(truth)
+    topo = store.load(map_file, clouds=method == "thesis")
+    if true is not None and topo.datum is None:
+        raise UsageError("--truth needs a georeferenced map: without a datum the two frames have nothing in common")
+    folder = results_folder(results)
+    with progress_bar(quiet) as progress:
+        run = pipeline.localize_bags(topo, bags, config, method, progress, (from_s, to_s))
+    errors = None if true is None or topo.datum is None else localization_errors(run.reports, true, topo.datum)
+    metrics = localization_metrics(run.reports, run.distance, run.update_ms, errors)
+    fixes = run.fixes
+    poses = np.array([f.map_T_robot for f in fixes]).reshape(-1, 4, 4)
+    write_tum(folder / "localization.tum", np.array([f.stamp_ns for f in fixes], np.int64), poses)
+    write_tum(folder / "smoothed.tum", *run.smoothed)
+    write_text(folder / "localization.csv", _csv(run.reports))
+    text = dump(config)
+    write_text(folder / "config.yaml", text)
+    figures = {"Localization": localization_figure(topo, run.reports)}
+    if errors is not None and len(errors.stamps_ns):
+        figures["Errors"] = localization_error_figure({method: errors})
+    (folder / "localization.png").write_bytes(figures["Localization"])
+    inputs = [{"path": p.name, "sha256": hash_of(p)} for p in (map_file, *bags)]
+    said = verdict(run.reports, run.distance)
+    notes = [*run.notes, said]
+    if run.exploded:
+        notes.append(f"{run.exploded} scans had more combinations than thesis.combinations and measured nothing")
+    write_json(
+        folder / "report.json", metrics, run.skipped, inputs, run.seconds, peak_mb(), notes=notes, versions=versions(),
+        topics=run.chosen, method=method,
+    )  # fmt: skip
+    facts = {"map": map_file.name, "method": method, "recorded": f"{run.duration_s:.0f} s", "topograph": __version__}
+    write_page(
+        folder / "report.html", f"Localization of {', '.join(p.name for p in bags)}", topo, metrics, figures, run.skipped,
+        notes, facts,
+    )  # fmt: skip
+    for note in run.notes:
+        click.echo(f"note: {note}", err=True)
+    table(metrics)
+    click.echo(f"{said}; report: {folder / 'report.html'}")
+
+
+def verdict(reports: Sequence[Any], distance: Sequence[float]) -> str:
+    """One line: found after how far, or unknown and why."""
+    committed = [i for i, r in enumerate(reports) if r.fix is not None]
+    if committed:
+        share = len(committed) / max(len(reports) - committed[0], 1)
+        return f"found after {distance[committed[0]]:.1f} m; a pose for {100 * share:.1f} % of the scans from then on"
+    last = reports[-1]
+    if last.hypotheses > 1:
+        return f"unknown: {last.hypotheses} places fit, up to {last.apart:.0f} m apart"
+    return "unknown: nothing on this map fits what was seen well enough"
+
+
+def _csv(reports: Sequence[Any]) -> str:
+    """One row per scan; the pose is empty while there is none."""
+    from topograph.geometry import to_quaternion
+
+    lines = ["stamp,state,x,y,z,qx,qy,qz,qw,hypotheses,risk,trees,tree_ids,apart,sigma_along,sigma_across"]
+    for r in reports:
+        stamp = f"{r.stamp_ns // 10**9}.{r.stamp_ns % 10**9:09d}"
+        pose = [""] * 7
+        if r.fix is not None:
+            T = r.fix.map_T_robot
+            pose = [f"{v:.6f}" for v in (*T[:3, 3], *to_quaternion(T))]
+        rest = [f"{v:.4f}" if np.isfinite(v) else "" for v in (r.apart, r.along, r.across)]
+        risk = f"{r.risk:.3e}" if np.isfinite(r.risk) else ""
+        ids = " ".join(map(str, r.trees.tolist()))
+        lines.append(",".join([stamp, r.state, *pose, str(r.hypotheses), risk, str(len(r.trees)), ids, *rest]))
+    return "\n".join(lines) + "\n"

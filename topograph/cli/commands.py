@@ -35,11 +35,13 @@ from topograph.errors import InputError, UsageError
 @click.option("--truth", type=click.Path(path_type=Path), help="Folder of simulated truth to compare with.")
 @click.option("--check-fixes", type=click.IntRange(0), default=0, metavar="N",
               help="Withhold every N-th fix from the estimator and report the path's distance from it (1: withhold all).")  # fmt: skip
+@click.option("--from", "from_s", type=float, default=0.0, help="Begin so many seconds into the recording.")
+@click.option("--to", "to_s", type=float, default=float("inf"), help="End there.")
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 @input_options
 def map_command(
     bags: tuple[Path, ...], output: Path | None, into: Path | None, results: Path | None, truth: Path | None,
-    check_fixes: int, quiet: bool, config_file: Path | None, **words: Any,
+    check_fixes: int, from_s: float, to_s: float, quiet: bool, config_file: Path | None, **words: Any,
 ) -> None:  # fmt: skip
     """Make a map of the trees in BAGS (one run)."""
     from topograph import pipeline, store
@@ -54,7 +56,7 @@ def map_command(
     if target.suffix != ".gpkg":
         raise UsageError(f"{target}: a map is a GeoPackage; end its name in .gpkg")
     with progress_bar(quiet) as progress:
-        run = pipeline.read_run(bags, config, progress)
+        run = pipeline.read_run(bags, config, progress, (from_s, to_s))
         solved = pipeline.solve_run(run, config, check_fixes=check_fixes, known=old, progress=progress)
         topo = _save_results(solved, config, bags, folder, target, true, old, progress)
     no_trees = pipeline.why_no_trees(solved)

@@ -83,6 +83,7 @@ class GraphMethod:
         self._tilt = np.zeros(3)  # z of the base in the map (m), and roll and pitch (rad) beyond what gravity says
         self._tilt_cov = np.diag([100.0, 0.0, 0.0])
         self._up = 0.0
+        self._vertical = np.array([0.0, 0.0, 1.0])
         self._row = _row_direction(topo)
 
     def _begin(self, trunks: Trunks) -> Engine:
@@ -101,6 +102,8 @@ class GraphMethod:
             if not len(trunks):
                 return Report(trunks.stamp_ns, "searching", None, 0, 1.0, np.zeros((0, 3)), *_NONE, np.nan, np.nan)
             self.engine = self._begin(trunks)
+        if not leg.level:
+            leg = self._upright(leg, trunks)
         level_T_robot = from_xyz_rpy(0, 0, 0, leg.roll, leg.pitch, 0)
         flat = transform(level_T_robot, trunks.p) if len(trunks) else np.zeros((0, 3))
         self.move = move_of(leg, self.config)
@@ -118,6 +121,14 @@ class GraphMethod:
             trunks.stamp_ns, belief.state, fix, belief.hypotheses, belief.risk, belief.places, ids, belief.pairs,
             float(np.sqrt(along)), float(np.sqrt(across)),
         )  # fmt: skip
+
+    def _upright(self, leg: Leg, trunks: Trunks) -> Leg:
+        """Without an IMU the trunks say which way is up: on average they grow vertically."""
+        if len(trunks) >= 5 and (trunks.axis[:, 2] < 1.0 - 1e-9).any():
+            up = np.median(trunks.axis, axis=0)
+            self._vertical += 0.5 * (up / np.linalg.norm(up) - self._vertical)
+        x, y, z = self._vertical / np.linalg.norm(self._vertical)
+        return replace(leg, roll=float(np.arctan2(y, z)), pitch=float(-np.arcsin(x)))
 
     def _rise(self, leg: Leg, belief: Belief, trunks: Trunks, flat: Array) -> None:
         """Height, and what gravity leaves open of roll and pitch, from the heights at which known trees are seen."""

@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from topograph.config import Config
 from topograph.errors import InsufficientDataError
 from topograph.geometry import Array
 from topograph.localize import Fix, GraphMethod, Localizer, Move, Report, Sweep, ThesisMethod, smooth
-from topograph.pipeline.read import Progress, child_mount, silent, stream
+from topograph.pipeline.read import WHOLE, Progress, child_mount, silent, stream
 from topograph.topomap import TopoMap
 
 
@@ -52,11 +53,11 @@ class Replay:
 
 def localize_bags(
     topo: TopoMap, paths: Sequence[Path], config: Config, method: str = "graph", progress: Progress = silent,
-    until_s: tuple[float, float] = (0.0, np.inf),
+    span_s: tuple[float, float] = WHOLE,
 ) -> Replay:  # fmt: skip
     """Replay bags against a map; `method` is "graph" or "thesis". GNSS in the bags is not read.
 
-    Only scans within `until_s` (from, to) seconds of the first message count.
+    Only what lies within `span_s` (from, to) seconds of the first message counts.
 
     Raises:
         InsufficientDataError: neither scans nor odometry.
@@ -76,12 +77,7 @@ def localize_bags(
         localizer: Localizer | None = None
         buffer: list[Imu | Odometry] = []
         stretch = _Stretch()
-        first_ns = 0
-        for m in stream(recording, config.trunks, lambda _, share: progress("localize", share)):
-            first_ns = first_ns or m.stamp_ns
-            since = (m.stamp_ns - first_ns) * 1e-9
-            if not until_s[0] <= since < until_s[1]:
-                continue
+        for m in stream(recording, config.trunks, partial(_show, progress), span_s):
             if isinstance(m, (Imu, Odometry)):
                 buffer.append(m)
             elif isinstance(m, Trunks):
@@ -109,6 +105,10 @@ def localize_bags(
         progress("smooth", 1.0)
         out.seconds["smooth"] = time.perf_counter() - began
     return out
+
+
+def _show(progress: Progress, _: str, share: float) -> None:
+    progress("localize", share)
 
 
 def _begin(

@@ -18,6 +18,7 @@ from topograph.motion import Streams, StreamsBuilder, twist_during
 from topograph.trunks import TrunksConfig, from_recorded
 
 Progress = Callable[[str, float], None]
+WHOLE = (0.0, float("inf"))
 
 
 def silent(stage: str, share: float) -> None:
@@ -51,17 +52,23 @@ class Run:
 
 
 def stream(
-    recording: Recording, config: TrunksConfig, progress: Progress = silent
+    recording: Recording, config: TrunksConfig, progress: Progress = silent, span_s: tuple[float, float] = WHOLE
 ) -> Iterator[Trunks | Imu | Odometry | Fix | Heading]:
-    """The small messages as they come, and the trunks of each scan as soon as the motion during it is known."""
+    """The small messages as they come, and the trunks of each scan as soon as the motion during it is known.
+
+    Only what is stamped within `span_s` (from, to) seconds of the first message is given.
+    """
     detect = _detector(recording, config)
     builder = StreamsBuilder()
     pending: list[Scan] = []
-    newest = 0
+    newest = first = 0
     expected = max(1, sum(recording.counts[t] for t in recording.chosen.values()))
     for n, (_, product) in enumerate(recording.messages()):
         if n % 200 == 0:
             progress("read", n / expected)
+        first = first or product.stamp_ns
+        if not span_s[0] <= (product.stamp_ns - first) * 1e-9 < span_s[1]:
+            continue
         newest = max(newest, product.stamp_ns)
         if isinstance(product, Scan):
             pending.append(product)
@@ -77,8 +84,10 @@ def stream(
     progress("read", 1.0)
 
 
-def read_run(paths: Sequence[Path], config: Config, progress: Progress = silent) -> Run:
-    """Read a run once: small streams into arrays, scans into trunks as they come.
+def read_run(
+    paths: Sequence[Path], config: Config, progress: Progress = silent, span_s: tuple[float, float] = WHOLE
+) -> Run:
+    """Read a run (or `span_s` of it) once: small streams into arrays, scans into trunks as they come.
 
     Raises:
         InputError: nothing usable in the bags.
@@ -89,7 +98,7 @@ def read_run(paths: Sequence[Path], config: Config, progress: Progress = silent)
     with Recording(paths, config.bags) as recording:
         builder = StreamsBuilder()
         trunks: list[Trunks] = []
-        for product in stream(recording, config.trunks, progress):
+        for product in stream(recording, config.trunks, progress, span_s):
             if isinstance(product, Trunks):
                 trunks.append(product)
             else:

@@ -112,7 +112,7 @@ class Engine:
         if float(bits.sum()) < need:
             return
         h.informed = True
-        small = len(self.index.length) < 30000
+        small = len(self.index.length) < 10000
         if not small and h.found is not None and f.run - h.searched < c.again:
             h.posterior, h.rows = weigh(self._kept(h), marks, h.submap, self.index, c), rows
             if h.posterior.risk > c.risk:
@@ -224,8 +224,14 @@ class Engine:
                 own = -0.5 * m2[i, k] - 0.5 * logdet[i, k] - np.log(2 * np.pi)
                 lost += here - own
                 ratio = 1.0 + 2 * index.jitter**2 / np.exp(0.5 * logdet[i, k])
-                slip += min(0.5 * m2[i, k] * (1 - 1 / ratio) - np.log(ratio), 2.5)
-            elif f.n == 0 or m2[i].min() > 2.5 * c.gate:
+                # Where jitter is no larger than the noise, errors that stay would add up to a false alarm.
+                slip += min(ratio / 9.0, 1.0) * min(0.5 * m2[i, k] * (1 - 1 / ratio) - np.log(ratio), 2.5)
+            elif f.n and m2[i].min() <= 2.5 * c.gate:
+                # Too far from the tree to be it, too near to be another: as in a lattice that is off by its jitter.
+                k = int(np.argmin(m2[i]))
+                ratio = 1.0 + 2 * index.jitter**2 / np.exp(0.5 * logdet[i, k])
+                slip += 2.5 * min(ratio / 9.0, 1.0) if f.tree[k] >= 0 else 0.0
+            else:
                 at = f.mean[:2] + [c_ * z[i, 0] - s_ * z[i, 1], s_ * z[i, 0] + c_ * z[i, 1]]
                 if len(self.near(at, 1.3 / np.sqrt(index.density))):  # trees beyond the map's edge say nothing
                     lost += here - np.log(c.new * index.density + passing)

@@ -19,7 +19,7 @@ class MapIndex:
     Attributes:
         xy: (T, 2) m; `var` (T,) variance per axis, m²; `diameter` (T,) m or NaN.
         origin, cell: of the raster `nearest` (X, Y): the tree nearest to each cell's centre, -1: none near.
-        bucket, start, member: coarse cells of `bucket` m (see `buckets`) and their trees (CSR).
+        bucket, start, member: coarse cells of `bucket` m (see `buckets`) and their trees (CSR); `place` (T,) the cell of a tree.
         buckets: (2,) number of coarse cells along x and y.
         length: (P,) rising; `a`, `b` (P,) the pairs of trees so far apart.
         density: trees per m² where there are trees.
@@ -38,6 +38,7 @@ class MapIndex:
     buckets: NDArray[np.int64]
     start: NDArray[np.int32]
     member: NDArray[np.int32]
+    place: NDArray[np.int32]
     length: NDArray[np.float32]
     a: NDArray[np.int32]
     b: NDArray[np.int32]
@@ -53,7 +54,18 @@ class MapIndex:
     @property
     def bytes(self) -> int:
         """Memory of the index."""
-        arrays = (self.xy, self.var, self.diameter, self.nearest, self.start, self.member, self.length, self.a, self.b)
+        arrays = (
+            self.xy,
+            self.var,
+            self.diameter,
+            self.nearest,
+            self.start,
+            self.member,
+            self.place,
+            self.length,
+            self.a,
+            self.b,
+        )
         return sum(x.nbytes for x in arrays)
 
 
@@ -93,7 +105,7 @@ def build_index(xy: Array, var: Array, diameter: Array, view: float, longest: fl
         float(np.prod(high - low + 10.0)) if len(covered) * 100.0 > 0.3 * np.prod(high - low) else len(covered) * 400.0
     )
     return MapIndex(
-        xy, var, diameter, low, cell, nearest, bucket, buckets, start, order,
+        xy, var, diameter, low, cell, nearest, bucket, buckets, start, order, flat.astype(np.int32),
         length[by_length].astype(np.float32), pairs[by_length, 0].astype(np.int32), pairs[by_length, 1].astype(np.int32),
         density, area, _jitter(tree, xy, var, gap),
         float(np.mean(diameter[ok])) if ok.any() else np.nan, float(np.std(diameter[ok])) if ok.sum() > 1 else 0.0,

@@ -73,14 +73,19 @@ def search(marks: Landmarks, index: MapIndex, config: LocalizeConfig) -> Found:
     losses: list[Array] = []
     best, seeds, missed = np.inf, 0, 1.0
     order_all = np.argsort(marks.var - 0.02 * marks.lasting)
-    typical = -float(np.sum(marks.other - marks.tree))
+    alone = marks.tree - marks.other  # what a landmark costs that is no mapped tree
+    typical = float(np.sum(np.maximum(alone - np.log(2 * np.pi * (marks.var + config.map_sigma**2)), 0.0)))
     for used, (i, j, p_both, low, high) in enumerate(pairs):
         if missed < config.anchors and (best < 0.5 * typical or used >= 6):
             break
         order = np.concatenate([[i, j], order_all[(order_all != i) & (order_all != j)]]).astype(np.int64)
+        a, b = index.a[low:high], index.b[low:high]
+        if len(a) > 5000:  # neighbours after each other: the raster's cells are still in the processor's cache
+            near = np.argsort(index.place[a], kind="stable")
+            a, b = a[near], b[near]
         pose, loss, best = _seed(
             marks.m, marks.var, marks.diameter, marks.diameter_var, marks.other - marks.tree, order,
-            index.a[low:high], index.b[low:high], index.xy, index.var, index.diameter, index.diameter_mean,
+            a, b, index.xy, index.var, index.diameter, index.diameter_mean,
             index.diameter_sd, index.origin, index.cell, index.nearest, best, config.bound, config.map_sigma,
         )  # fmt: skip
         poses.append(pose)
@@ -146,7 +151,7 @@ def _anchors(marks: Landmarks, index: MapIndex, config: LocalizeConfig) -> list[
     return out[:12]
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=True)
 def _seed(
     m,
     var,
@@ -174,9 +179,11 @@ def _seed(
     count = 0
     i, j = order[0], order[1]
     base = map_sigma * map_sigma
+    volume = np.empty(n)
     floor = np.empty(n)  # the least that a landmark can cost: then a running loss only rises
     for q in range(n):
-        floor[q] = min(-other[q], np.log(2 * np.pi * (var[q] + base)))
+        volume[q] = np.log(2 * np.pi * (var[q] + base))
+        floor[q] = min(-other[q], volume[q])
     ex, ey = m[j, 0] - m[i, 0], m[j, 1] - m[i, 1]
     for s in range(2 * len(pa)):
         if s % 2 == 0:
@@ -197,7 +204,7 @@ def _seed(
         loss = _diameter(dia[i], dia_var[i], tdia[a], dmean, dsd) + _diameter(dia[j], dia_var[j], tdia[b], dmean, dsd)
         gap = np.sqrt(fx * fx + fy * fy) - np.sqrt(ex * ex + ey * ey)
         loss += 3.0 * np.log(1.0 + gap * gap * w2 / 4.0)
-        loss += np.log(2 * np.pi * (var[i] + base)) - floor[i] + np.log(2 * np.pi * (var[j] + base)) - floor[j]
+        loss += volume[i] - floor[i] + volume[j] - floor[j]
         u0, u1 = a, b
         for o in range(2, n):
             k = order[o]
@@ -214,7 +221,8 @@ def _seed(
                 own = var[k] + base + tvar[t]
                 V = own + 1.0 / W + (rx * rx + ry * ry) / inertia
                 d2 = vx * vx + vy * vy
-                matched = 3.0 * np.log(1.0 + d2 / (4.0 * V)) + np.log(2 * np.pi * own)
+                # ln of (own / (own - tvar)) to first order
+                matched = 3.0 * np.log(1.0 + d2 / (4.0 * V)) + volume[k] + tvar[t] / own
                 matched += _diameter(dia[k], dia_var[k], tdia[t], dmean, dsd)
                 if matched < cost:
                     cost = matched

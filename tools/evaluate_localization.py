@@ -41,7 +41,7 @@ def told(c: StartsConfig, **changes: float) -> LocalizeConfig:
 def index_of(w: World, c: StartsConfig, config: LocalizeConfig) -> MapIndex:
     """The map's index; diameters only where the scenario measures them."""
     diameters = w.mapped_diameters if np.isfinite(c.diameter_sigma) else np.full(len(w.mapped), np.nan)
-    return build_index(w.mapped, np.zeros(len(w.mapped)), diameters, c.view, config.pair)
+    return build_index(w.mapped, np.zeros(len(w.mapped)), diameters, c.view, config.pair, config.map_sigma)
 
 
 def feed(engine: Engine, s: Step, c: StartsConfig) -> Belief:

@@ -51,7 +51,7 @@ class LocalizeConfig:
     scales: tuple[float, ...] = (1.0, 1.5, 2.2)
     scale_prior: tuple[float, ...] = (0.9, 0.07, 0.03)
     unknown: float = 0.02
-    alike: float = 5e-5
+    alike: float = 1e-4
     gate: float = 13.8
     pair: float = 16.0
     anchors: float = 1e-3

@@ -109,8 +109,8 @@ class Engine:
             ok = np.isfinite(marks.diameter)
             bits[ok] += 0.5 * np.log1p(self.index.diameter_sd**2 / marks.diameter_var[ok]) * marks.lasting[ok]
         need = c.information * np.log(4.0 * len(self.index) / c.risk)
-        if float(bits.sum()) < need:
-            return
+        if float(bits.sum()) < need and (len(marks) < 10 or f.run - h.searched < 2 * c.again):
+            return  # too little to decide; where planting is regular, the places that are left are still counted
         h.informed = True
         small = len(self.index.length) < 10000
         if not small and h.found is not None and f.run - h.searched < c.again:

@@ -107,7 +107,7 @@ def weigh(found: Found, marks: Landmarks, submap: Submap, index: MapIndex, confi
         index.buckets, index.start, index.member, submap.raster, submap.origin, c.felled, c.map_sigma**2,
     )  # fmt: skip
     log, pose, tree, scale, cov, alike = _evidence(
-        found.pose, *arguments, index.density, 2.0 * index.jitter**2, scales, prior, c.bound, found.loss
+        found.pose, *arguments, index.density, index.trust, 2.0 * index.jitter**2, scales, prior, c.bound, found.loss
     )
     order = np.argsort(-log)
     order = order[np.isfinite(log[order])]
@@ -215,7 +215,7 @@ def _match(
 @njit(cache=True)
 def _evidence(
     poses, m, P, tree, other, dia, dia_var, var, xy, tvar, tdia, dmean, dsd, origin, cell, nearest, bucket, buckets, start,
-    member, raster, so, felled, base, density, wild, scales, prior, bound, loss,
+    member, raster, so, felled, base, density, trust, wild, scales, prior, bound, loss,
 ):  # fmt: skip
     n, M = len(m), len(poses)
     log = np.full(M, -np.inf)
@@ -268,7 +268,7 @@ def _evidence(
             if k < 2:
                 ok = False
                 break
-            x, y, yaw, q, logdet, L = _align(rows, ids, m, P, xy, tvar, base, 0.0, x, y, yaw)
+            x, y, yaw, q, logdet, L = _align(rows, ids, m, P, xy, tvar, base, 0.0, 1.0, x, y, yaw)
         if not ok:
             continue
         fixed = 0.0
@@ -283,12 +283,12 @@ def _evidence(
         dof = 2 * k - 3
         half = -0.5 * logdet - 0.5 * np.linalg.slogdet(L)[1] + (1.5 - k) * np.log(2 * np.pi)
         for a in range(len(scales)):
-            value = half - 0.5 * q / scales[a] ** 2 - dof * np.log(scales[a]) + prior[a]
+            value = half - 0.5 * trust * q / scales[a] ** 2 - dof * np.log(scales[a]) + prior[a]
             if value > top:
                 top = value
                 scale[h] = scales[a]
         for a in range(len(scales)):
-            total += np.exp(half - 0.5 * q / scales[a] ** 2 - dof * np.log(scales[a]) + prior[a] - top)
+            total += np.exp(half - 0.5 * trust * q / scales[a] ** 2 - dof * np.log(scales[a]) + prior[a] - top)
         log[h] = fixed + top + np.log(total)
         out[h, 0], out[h, 1], out[h, 2] = x, y, yaw
         trees[h] = ids
@@ -297,13 +297,17 @@ def _evidence(
             best = log[h]
         if log[h] > best - 6.0:
             # The same trees planted anew: their residuals are larger by both orchards' planting errors.
-            _, _, _, qa, la, La = _align(rows, ids, m, P, xy, tvar, base, wild, x, y, yaw)
-            alike[h] = fixed - 0.5 * qa - 0.5 * la - 0.5 * np.linalg.slogdet(La)[1] + (1.5 - k) * np.log(2 * np.pi)
+            for a in range(len(scales)):
+                _, _, _, qa, la, La = _align(rows, ids, m, P, xy, tvar, base, wild, scales[a] ** 2, x, y, yaw)
+                anew = (
+                    fixed - 0.5 * trust * qa - 0.5 * la - 0.5 * np.linalg.slogdet(La)[1] + (1.5 - k) * np.log(2 * np.pi)
+                )
+                alike[h] = np.logaddexp(alike[h], anew - np.log(len(scales)))
     return log, out, trees, scale, covs, alike
 
 
 @njit(cache=True)
-def _align(rows, ids, m, P, xy, tvar, base, wild, x, y, yaw):
+def _align(rows, ids, m, P, xy, tvar, base, wild, noise, x, y, yaw):
     """Least squares of a placement with the joint covariance: pose, chi-square, log |S|, information (3, 3)."""
     k = len(rows)
     S = np.empty((2 * k, 2 * k))
@@ -315,9 +319,9 @@ def _align(rows, ids, m, P, xy, tvar, base, wild, x, y, yaw):
             j = rows[b]
             for u in range(2):
                 for v in range(2):
-                    S[2 * a + u, 2 * b + v] = P[2 * i + u, 2 * j + v]
-        S[2 * a, 2 * a] += base + tvar[ids[i]] + wild
-        S[2 * a + 1, 2 * a + 1] += base + tvar[ids[i]] + wild
+                    S[2 * a + u, 2 * b + v] = noise * P[2 * i + u, 2 * j + v]
+        S[2 * a, 2 * a] += noise * (base + tvar[ids[i]]) + wild
+        S[2 * a + 1, 2 * a + 1] += noise * (base + tvar[ids[i]]) + wild
         # Residuals in the submap's frame, where the covariance is: R^T (tree - t) - m.
         ex, ey = xy[ids[i], 0] - x, xy[ids[i], 1] - y
         px, py = c * ex + s * ey, -s * ex + c * ey

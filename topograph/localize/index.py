@@ -25,6 +25,7 @@ class MapIndex:
         density: trees per m² where there are trees.
         area: m² in which the robot may be.
         jitter: irregularity of the planting per axis, m, without the map's own error.
+        trust: share (0-1) of the residuals' evidence that counts: none where all irregularity may be the map's own error.
         diameter_mean, diameter_sd: of the population.
     """
 
@@ -45,6 +46,7 @@ class MapIndex:
     density: float
     area: float
     jitter: float
+    trust: float
     diameter_mean: float
     diameter_sd: float
 
@@ -69,10 +71,12 @@ class MapIndex:
         return sum(x.nbytes for x in arrays)
 
 
-def build_index(xy: Array, var: Array, diameter: Array, view: float, longest: float) -> MapIndex:
+def build_index(
+    xy: Array, var: Array, diameter: Array, view: float, longest: float, map_sigma: float = 0.03
+) -> MapIndex:
     """Index of trees (T, 2) with variances per axis (T,) and diameters (T,) or NaN.
 
-    `view` is the range of detections (m); pairs up to `longest` are listed, fewer where trees are dense, so that a
+    `map_sigma` (m) is what the variances do not know of the map's error; `view` is the range of detections (m); pairs up to `longest` are listed, fewer where trees are dense, so that a
     tree has about 30.
     """
     tree = cKDTree(xy)
@@ -101,13 +105,15 @@ def build_index(xy: Array, var: Array, diameter: Array, view: float, longest: fl
     length = np.linalg.norm(xy[pairs[:, 0]] - xy[pairs[:, 1]], axis=1) if len(pairs) else np.zeros(0)
     by_length = np.argsort(length)
     ok = np.isfinite(diameter)
+    jitter = _jitter(tree, xy, var + map_sigma**2, gap)
     area = (
         float(np.prod(high - low + 10.0)) if len(covered) * 100.0 > 0.3 * np.prod(high - low) else len(covered) * 400.0
     )
     return MapIndex(
         xy, var, diameter, low, cell, nearest, bucket, buckets, start, order, flat.astype(np.int32),
         length[by_length].astype(np.float32), pairs[by_length, 0].astype(np.int32), pairs[by_length, 1].astype(np.int32),
-        density, area, _jitter(tree, xy, var, gap),
+        density, area, jitter,
+        float(min(1.0, jitter**2 / (map_sigma**2 + float(np.median(var))))),
         float(np.mean(diameter[ok])) if ok.any() else np.nan, float(np.std(diameter[ok])) if ok.sum() > 1 else 0.0,
     )  # fmt: skip
 

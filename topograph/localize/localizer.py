@@ -94,7 +94,9 @@ class GraphMethod:
         xy = t.p[:, :2] + t.axis[:, :2] * (self.height / np.maximum(t.axis[:, 2:], 0.3))
         var = 0.5 * (t.cov[:, 0, 0] + t.cov[:, 1, 1])
         var = np.where(np.isfinite(var), np.clip(var - 0.5 * np.trace(t.datum_cov[:2, :2]), 0.0, 1.0), 0.0)
-        return Engine(build_index(xy, var, t.diameter, self.config.view, self.config.pair), self.config)
+        return Engine(
+            build_index(xy, var, t.diameter, self.config.view, self.config.pair, self.config.map_sigma), self.config
+        )
 
     def step(self, trunks: Trunks, leg: Leg) -> Report:
         """One scan further."""

@@ -18,17 +18,51 @@ from topograph.trunks.runs import (
     RANGE,
     RING,
     WIDTH,
-    count_around,
-    sides_covered,
+    look_around,
 )
 
 FEATURES = (
     "range", "rings", "points", "diameter", "width_spread", "rough", "line_rms", "lean", "free", "lowest", "highest",
     "canopy", "undergrowth", "top_visible", "fill", "taper", "depth_slope", "ring_gap", "overhead", "close_by",
-    "covered_near", "covered",
+    "covered_near", "covered", "beside", "diameter_held",
 )  # fmt: skip
 OUT_SIZE = 16
 """x, y, z, axis (3), diameter, height, radial and tangential sigma, lean sigma, points, rings, range, bearing x, y."""
+
+
+@njit(cache=True)
+def vertical(runs, chain, most):
+    """Which way trunks grow, as horizontal metres per metre of height (2,), in the base's frame: the median lean of what
+    several rings cross, drawn to zero where there is little of it. On a slope the base is tilted and the trees are not.
+    """
+    k = runs.shape[0]
+    lean = np.zeros((2, most))
+    n = 0
+    count, height = np.zeros(k), np.zeros(k)
+    mx, my, zz, zx, zy = np.zeros(k), np.zeros(k), np.zeros(k), np.zeros(k), np.zeros(k)
+    for i in range(k):
+        c, w = chain[i], runs[i, COUNT]
+        count[c] += w
+        height[c] += w * runs[i, PZ]
+        mx[c] += w * runs[i, PX]
+        my[c] += w * runs[i, PY]
+    for i in range(k):
+        c, w = chain[i], runs[i, COUNT]
+        dz = runs[i, PZ] - height[c] / count[c]
+        zz[c] += w * dz * dz
+        zx[c] += w * dz * (runs[i, PX] - mx[c] / count[c])
+        zy[c] += w * dz * (runs[i, PY] - my[c] / count[c])
+    for c in range(k):
+        # More than 0.3 m of spread over more than a dozen returns: the slope is known to a few degrees.
+        if count[c] >= 12 and zz[c] > 0.09 * count[c] and n < most:
+            lx, ly = zx[c] / zz[c], zy[c] / zz[c]
+            if lx * lx + ly * ly < 0.25:
+                lean[0, n], lean[1, n] = lx, ly
+                n += 1
+    if n < 3:
+        return np.zeros(2)
+    gain = n / (n + 2.0)
+    return np.array([gain * np.median(lean[0, :n]), gain * np.median(lean[1, :n])])
 
 
 @njit(cache=True)
@@ -60,10 +94,12 @@ def fit_chains(
     """
     k = runs.shape[0]
     out = np.empty((k, OUT_SIZE))
-    feature = np.empty((k, 22))
+    feature = np.empty((k, 24))
     name = np.empty(k, np.int64)
     n_out = 0
     members = np.empty(k, np.int64)
+    up = vertical(runs, chain, 64)
+    over, side = np.zeros(5), np.zeros(5)
     for c in range(k):
         if chain[c] != c:
             continue
@@ -130,8 +166,9 @@ def fit_chains(
                 szx += cw[q] * dz * (cx[q] - xm)
                 szy += cw[q] * dz * (cy[q] - ym)
             noise = 0.035**2 * 6.0  # of one ring's centre, in the units of the weights
-            lean_precision = szz + noise / 0.14**2
-            lx, ly = szx / lean_precision, szy / lean_precision
+            lean_precision = szz + noise / 0.12**2
+            lx = (szx + noise / 0.12**2 * up[0]) / lean_precision
+            ly = (szy + noise / 0.12**2 * up[1]) / lean_precision
             x0, y0 = xm, ym
             if turn < 2:
                 for q in range(n):
@@ -174,10 +211,10 @@ def fit_chains(
         d = np.sqrt((px - eye[0]) ** 2 + (py - eye[1]) ** 2)
         row[14], row[15] = (px - eye[0]) / d, (py - eye[1]) / d
         # Features.
-        overhead, canopy = count_around(above, px + lx, py + ly, 0.4, 1.5)
-        close_by, under = count_around(beside, px, py, 0.5, 1.3)
+        look_around(above, px + 1.5 * lx, py + 1.5 * ly, 0.35, 0.9, 1.6, over)
+        look_around(beside, px, py, 0.5, 0.9, 1.3, side)
         f = feature[n_out]
-        seen_top = eye[2] + d * np.tan(top) - ground
+        seen_top = eye[2] + d * top - ground
         upper, lower, nu, nl = 0.0, 0.0, 0.0, 0.0
         for q in range(n):
             if cz[q] > zm:
@@ -191,19 +228,20 @@ def fit_chains(
         f[3], f[4] = measured, spread
         f[5] = np.sqrt(rough2 / max(rough_n, 1.0))
         f[6] = np.sqrt(line2 / n)
-        f[7] = np.sqrt(lx * lx + ly * ly)
+        f[7] = np.sqrt((lx - up[0]) ** 2 + (ly - up[1]) ** 2)
         f[8] = free / (2.0 * n)
         f[9], f[10] = lowest, highest
-        f[11], f[12] = np.log(1.0 + canopy), np.log(1.0 + under)
+        f[11], f[12] = np.log(1.0 + over[1] + over[2]), np.log(1.0 + side[1] + side[2])
         f[13] = min(seen_top, 5.0)
         f[14] = points * step * far / max(n * measured, 0.03)
         f[15] = (upper / nu - lower / nl) if nu > 0 and nl > 0 else 0.0
         f[16] = (runs[last, RANGE] - runs[first, RANGE]) / max(highest - lowest, 0.3)
         f[17] = (runs[last, RING] - runs[first, RING] + 1.0) / n
-        f[18] = np.log(1.0 + overhead)
-        f[19] = np.log(1.0 + max(close_by - points, 0.0))
-        f[20] = sides_covered(above, px + lx, py + ly, 0.3, 0.9)
-        f[21] = sides_covered(above, px + lx, py + ly, 0.9, 1.6)
+        f[18] = np.log(1.0 + over[0])
+        f[19] = np.log(1.0 + max(side[0] - points, 0.0))
+        f[20], f[21] = over[3], over[4]
+        f[22] = side[3] + side[4]
+        f[23] = diameter
         name[n_out] = c
         n_out += 1
     return out[:n_out], feature[:n_out], name[:n_out]
@@ -225,3 +263,59 @@ def suppress(out, score, distance):
             if group[j] < 0 and (out[i, 0] - out[j, 0]) ** 2 + (out[i, 1] - out[j, 1]) ** 2 < distance * distance:
                 group[j] = i
     return group
+
+
+@njit(cache=True)
+def merge_stems(fits, odds, group):
+    """Rows (B,) of the best of each group, and their fits (B, OUT_SIZE): stems of one tree meet at its foot, and their
+    mean, by points, stands for the tree.
+    """
+    n = len(group)
+    best = np.empty(n, np.int64)
+    out = np.empty((n, OUT_SIZE))
+    b = 0
+    for i in range(n):
+        if group[i] != i:
+            continue
+        best[b] = i
+        out[b] = fits[i]
+        total, stems = 0.0, 0
+        mean = np.zeros(6)
+        for j in range(n):
+            if group[j] == i and odds[j] > 0.5 * odds[i]:
+                total += fits[j, 11]
+                stems += 1
+                for q in range(6):
+                    mean[q] += fits[j, 11] * fits[j, q]
+        if stems > 1:
+            size = np.sqrt(mean[3] ** 2 + mean[4] ** 2 + mean[5] ** 2)
+            for q in range(6):
+                out[b, q] = mean[q] / (total if q < 3 else size)
+            out[b, 8] = np.hypot(out[b, 8], 0.05)
+            out[b, 9] = np.hypot(out[b, 9], 0.05)
+        b += 1
+    return best[:b], out[:b]
+
+
+@njit(cache=True)
+def gather(wanted, n_groups, chain, runs, label):
+    """Indices of the points of chains by group: `wanted` (K,) is the group of each chain or -1. Flat (M,), ends (G+1,)."""
+    k = runs.shape[0]
+    ends = np.zeros(n_groups + 1, np.int64)
+    for i in range(k):
+        g = wanted[chain[i]]
+        if g >= 0:
+            ends[g + 1] += int(runs[i, COUNT])
+    for g in range(n_groups):
+        ends[g + 1] += ends[g]
+    fill = ends[:-1].copy()
+    out = np.empty(ends[n_groups], np.int64)
+    for i in range(k):
+        g = wanted[chain[i]]
+        if g < 0:
+            continue
+        for m in range(int(runs[i, FIRST]), int(runs[i, LAST]) + 1):
+            if label[m] == i:
+                out[fill[g]] = m
+                fill[g] += 1
+    return out, ends

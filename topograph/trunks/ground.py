@@ -5,23 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-HALF = 32
-"""Cells of 1 m in each direction from the base."""
+from topograph.trunks.organise import HALF
 
 
 @njit(cache=True)
-def fit_ground(p):
-    """Plane (3,) z = a + b x + c y, and residual heights (2·HALF, 2·HALF) on 1 m cells, all in the base's frame, m.
+def fit_ground(low):
+    """Plane (3,) z = a + b x + c y, and residual heights (2·HALF, 2·HALF) on 1 m cells, all in the base's frame, m, from
+    the lowest points of the cells (1e9: none).
 
     Lowest points of cells vote; a cell that stands above its neighbours shows a thing, not the ground. Gaps are
     filled by diffusion, towards the plane where nothing is near.
     """
     size = 2 * HALF
-    low = np.full((size, size), 1e9, np.float32)
-    for i in range(p.shape[0]):
-        x, y = int(np.floor(p[i, 0])) + HALF, int(np.floor(p[i, 1])) + HALF
-        if 0 <= x < size and 0 <= y < size and p[i, 2] < low[x, y]:
-            low[x, y] = p[i, 2]
     xs = np.empty(size * size)
     ys, zs = np.empty(size * size), np.empty(size * size)
     n = 0
@@ -42,7 +37,7 @@ def fit_ground(p):
             near[m] = zs[k]
             m += 1
     plane[0] = np.percentile(near[:m], 25) if m > 5 else np.percentile(zs[:n], 15)
-    for turn in range(12):
+    for turn in range(9):
         s = np.zeros((3, 3))
         t = np.zeros(3)
         width = 0.6 if turn < 4 else 0.25
@@ -75,6 +70,10 @@ def fit_ground(p):
                     grid[i, j] = e
                     valid[i, j] = True
     # A cell much above a neighbour shows a thing; drop it.
+    reach = np.empty((5, 5), np.float32)
+    for di in range(5):
+        for dj in range(5):
+            reach[di, dj] = 0.12 * np.sqrt((di - 2.0) ** 2 + (dj - 2.0) ** 2)
     for _ in range(2):
         for i in range(1, size - 1):
             for j in range(1, size - 1):
@@ -85,7 +84,7 @@ def fit_ground(p):
                     for dj in range(-2, 3):
                         a, b = i + di, j + dj
                         if 0 <= a < size and 0 <= b < size and valid[a, b]:
-                            g = grid[a, b] + 0.12 * np.sqrt(di * di + dj * dj)
+                            g = grid[a, b] + reach[di + 2, dj + 2]
                             if g < least:
                                 least = g
                 if grid[i, j] > least + 0.12:
@@ -94,14 +93,15 @@ def fit_ground(p):
         for j in range(size):
             if not valid[i, j]:
                 grid[i, j] = 0.0
-    for _ in range(16):
+    quarter, keep, fade = np.float32(0.25), np.float32(0.75), np.float32(0.985)
+    for _ in range(12):
         for i in range(1, size - 1):
             for j in range(1, size - 1):
-                around = 0.25 * (grid[i - 1, j] + grid[i + 1, j] + grid[i, j - 1] + grid[i, j + 1])
+                around = quarter * (grid[i - 1, j] + grid[i + 1, j] + grid[i, j - 1] + grid[i, j + 1])
                 if valid[i, j]:
-                    grid[i, j] = 0.75 * grid[i, j] + 0.25 * around
+                    grid[i, j] = keep * grid[i, j] + quarter * around
                 else:
-                    grid[i, j] = 0.985 * around
+                    grid[i, j] = fade * around
     return plane, grid
 
 

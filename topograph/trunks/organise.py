@@ -7,7 +7,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from topograph.bags import Scan
-from topograph.geometry import Array
+
+HALF = 32
+"""Ground cells of 1 m in each direction from the base."""
 
 
 def rings_of(scan: Scan) -> tuple[NDArray[np.int32], int]:
@@ -39,42 +41,47 @@ def rings_of(scan: Scan) -> tuple[NDArray[np.int32], int]:
 
 @njit(cache=True)
 def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
-    """Points sorted by ring, azimuth within it: base-frame xyz (M, 3), range (M,), azimuth (M,), ring starts (R+1,).
+    """Points in ring order: base-frame xyz (M, 3), horizontal range from the sensor (M,), ring starts (R+1,), the tangent
+    of the highest ring's elevation, and the lowest point (2 HALF, 2 HALF) of each ground cell.
 
     `offset` (N,) s or empty; `twist` (6,) of the base. First the motion during the sweep is taken out, to second
     order in the sweep's time; then the points are where they were at the stamp, seen from the base then.
     """
     n = xyz.shape[0]
-    R = base_T_lidar[:3, :3]
-    tx, ty, tz = base_T_lidar[0, 3], base_T_lidar[1, 3], base_T_lidar[2, 3]
-    vx, vy, vz, wx, wy, wz = twist[0], twist[1], twist[2], twist[3], twist[4], twist[5]
+    R = base_T_lidar[:3, :3].astype(np.float32)
+    tx, ty, tz = np.float32(base_T_lidar[0, 3]), np.float32(base_T_lidar[1, 3]), np.float32(base_T_lidar[2, 3])
+    v = twist.astype(np.float32)
+    vx, vy, vz, wx, wy, wz = v[0], v[1], v[2], v[3], v[4], v[5]
+    half = np.float32(0.5)
     timed = offset.shape[0] == n
     count = np.zeros(n_rings + 1, np.int64)
-    distance = np.empty(n, np.float32)
-    near2, far2 = near * near, far * far
+    near2, far2 = np.float32(near * near), np.float32(far * far)
+    inside = np.zeros(n, np.bool_)
     for i in range(n):
         x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
         d2 = x * x + y * y + z * z
         k = ring[i]
         if near2 < d2 < far2 and 0 <= k < n_rings:  # NaN compares false
-            distance[i] = np.sqrt(d2)
+            inside[i] = True
             count[k + 1] += 1
-        else:
-            distance[i] = -1.0
     for k in range(n_rings):
         count[k + 1] += count[k]
     starts = count.copy()
     m = count[n_rings]
     p = np.empty((m, 3), np.float32)
     r = np.empty(m, np.float32)
-    a = np.empty(m, np.float32)
     fill = count[:-1].copy()
+    rise, flat = np.zeros(n_rings), np.zeros(n_rings)
+    low = np.full((2 * HALF, 2 * HALF), 1e9, np.float32)
     for i in range(n):
-        if distance[i] < 0:
+        if not inside[i]:
             continue
-        k = fill[ring[i]]
-        fill[ring[i]] += 1
+        g = ring[i]
+        k = fill[g]
+        fill[g] = k + 1
         x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        rise[g] += z
+        flat[g] += np.sqrt(x * x + y * y)
         bx = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + tx
         by = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + ty
         bz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + tz
@@ -82,15 +89,16 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
             t = offset[i]
             # p + t (v + w x p) + t²/2 w x (v + w x p)
             ux, uy, uz = vx + wy * bz - wz * by, vy + wz * bx - wx * bz, vz + wx * by - wy * bx
-            h = 0.5 * t * t
-            bx, by, bz = (
-                bx + t * ux + h * (wy * uz - wz * uy),
-                by + t * uy + h * (wz * ux - wx * uz),
-                bz + t * uz + h * (wx * uy - wy * ux),
-            )
+            h = half * t * t
+            bx += t * ux + h * (wy * uz - wz * uy)
+            by += t * uy + h * (wz * ux - wx * uz)
+            bz += t * uz + h * (wx * uy - wy * ux)
         p[k, 0], p[k, 1], p[k, 2] = bx, by, bz
-        r[k] = np.sqrt(x * x + y * y)
-        a[k] = np.arctan2(y, x)
+        ex, ey = bx - tx, by - ty
+        r[k] = np.sqrt(ex * ex + ey * ey)
+        cx, cy = int(bx + HALF), int(by + HALF)
+        if bx > -HALF and by > -HALF and cx < 2 * HALF and cy < 2 * HALF and bz < low[cx, cy]:
+            low[cx, cy] = bz
     for k in range(n_rings):
         lo, hi = starts[k], starts[k + 1]
         if hi - lo < 3:
@@ -98,24 +106,46 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
         # Firing order is azimuth order but for the place where the turn closes; anything else is sorted.
         up, down = 0, 0
         for i in range(lo + 1, hi):
-            d = a[i] - a[i - 1]
-            if d < 0:
+            side = (p[i - 1, 0] - tx) * (p[i, 1] - ty) - (p[i - 1, 1] - ty) * (p[i, 0] - tx)
+            if side < 0:
                 down += 1
-            elif d > 0:
+            elif side > 0:
                 up += 1
         if min(up, down) > 2 + (hi - lo) // 200:
-            order = np.argsort(a[lo:hi])
+            order = np.argsort(np.arctan2(p[lo:hi, 1] - ty, p[lo:hi, 0] - tx))
             p[lo:hi] = p[lo:hi][order]
             r[lo:hi] = r[lo:hi][order]
-            a[lo:hi] = a[lo:hi][order]
-    return p, r, a, starts
+    top = 0.26
+    for k in range(n_rings - 1, -1, -1):
+        if starts[k + 1] - starts[k] > 20:
+            top = rise[k] / flat[k]
+            break
+    return p, r, starts, top, low
 
 
-def angular_step(azimuth: Array, starts: NDArray[np.int64]) -> float:
-    """Angle between neighbouring firings, rad: the commonest small step within rings."""
-    step = np.abs(np.diff(azimuth))
-    step = step[(step > 2e-4) & (step < 0.05)]
-    if len(step) < 50:
+@njit(cache=True)
+def angle_between(p, r, eye, i, j):
+    """Angle (sine of it) between two points of a ring as the sensor sees them."""
+    ax, ay, bx, by = p[i, 0] - eye[0], p[i, 1] - eye[1], p[j, 0] - eye[0], p[j, 1] - eye[1]
+    return abs(ax * by - ay * bx) / (r[i] * r[j])
+
+
+@njit(cache=True)
+def angular_step(p, r, eye, starts):
+    """Angle between neighbouring firings, rad: the commonest small step within rings, from a sample of them."""
+    m = p.shape[0]
+    every = max(1, m // 1200)
+    out = np.empty(m // every + len(starts))
+    n = 0
+    for k in range(len(starts) - 1):
+        for i in range(starts[k], starts[k + 1] - 1, every):
+            a = angle_between(p, r, eye, i, i + 1)
+            if 2e-4 < a < 0.05:
+                out[n] = a
+                n += 1
+    if n < 50:
         return 0.0035
-    low = np.percentile(step, 30)
-    return float(np.clip(np.median(step[step < 1.6 * low]), 8e-4, 0.02))
+    steps = np.sort(out[:n])
+    low = steps[int(0.3 * n)]
+    last = np.searchsorted(steps, 1.6 * low)
+    return min(max(steps[last // 2], 8e-4), 0.02)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from topograph.trunks.ground import HALF, ground_at
+from topograph.trunks.organise import HALF, angle_between
 
 # Columns of a run.
-FIRST, LAST, RING, PX, PY, PZ, RANGE, WIDTH, FREE, HEIGHT, COUNT, BEARING = range(12)
-RUN_SIZE = 12
+FIRST, LAST, RING, PX, PY, PZ, RANGE, WIDTH, FREE, HEIGHT, COUNT = range(11)
+RUN_SIZE = 11
 
 
 CELLS = 8 * HALF
@@ -21,61 +21,71 @@ def heights(p, plane, grid):
     """Height above ground (M,) of points; counts of what is overhead (1.9-5 m) and beside (0.3-1.5 m) per 0.25 m cell."""
     m = p.shape[0]
     h = np.empty(m, np.float32)
-    above = np.zeros((CELLS, CELLS), np.int32)
-    beside = np.zeros((CELLS, CELLS), np.int32)
+    above = np.zeros((CELLS, CELLS), np.int16)
+    beside = np.zeros((CELLS, CELLS), np.int16)
+    half, quarter, one = np.float32(HALF), np.float32(4.0), np.float32(1.0)
+    shift, last = np.float32(HALF - 0.5), 2 * HALF - 2
+    p0, p1, p2 = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
     for i in range(m):
         x, y = p[i, 0], p[i, 1]
-        h[i] = p[i, 2] - ground_at(x, y, plane, grid)
-        a, b = int(4.0 * (x + HALF)), int(4.0 * (y + HALF))
-        if 0 <= a < CELLS and 0 <= b < CELLS:
-            if 1.9 < h[i] < 5.0:
-                above[a, b] += 1
-            elif 0.3 < h[i] < 1.5:
-                beside[a, b] += 1
+        t = p[i, 2] - p0 - p1 * x - p2 * y
+        u, v = x + shift, y + shift  # ground_at, inlined: this is the one loop over all points that needs it
+        if u >= 0 and v >= 0:
+            a, b = int(u), int(v)
+            if a <= last and b <= last:
+                fu, fv = u - a, v - b
+                t -= (one - fu) * ((one - fv) * grid[a, b] + fv * grid[a, b + 1])
+                t -= fu * ((one - fv) * grid[a + 1, b] + fv * grid[a + 1, b + 1])
+        h[i] = t
+        if 0.3 < t < 5.0 and (t < 1.5 or t > 1.9):
+            a, b = int(quarter * (x + half)), int(quarter * (y + half))
+            if 0 <= a < CELLS and 0 <= b < CELLS:
+                if t > 1.9:
+                    above[a, b] += 1
+                else:
+                    beside[a, b] += 1
     return h, above, beside
 
 
 @njit(cache=True)
-def count_around(cells, x, y, inner, outer):
-    """Points within `inner` m, and between `inner` and `outer` m, of a position."""
+def look_around(cells, x, y, first, second, third, out):
+    """Points within `first` m, from there to `second` and to `third` m, and the octants covered in the outer two: (5,) `out`.
+
+    A canopy is all around its trunk; what stands on one side only is another thing's.
+    """
     i, j = int(4.0 * (x + HALF)), int(4.0 * (y + HALF))
-    near, far = 0, 0
-    k = int(4.0 * outer) + 1
+    out[:] = 0.0
+    inner, outer = 0, 0
+    k = int(4.0 * third) + 1
+    one, two, three = first * first, second * second, third * third
     for a in range(max(i - k, 0), min(i + k + 1, CELLS)):
         for b in range(max(j - k, 0), min(j + k + 1, CELLS)):
-            if cells[a, b] == 0:
+            c = cells[a, b]
+            if c == 0:
                 continue
             dx, dy = 0.25 * (a + 0.5) - HALF - x, 0.25 * (b + 0.5) - HALF - y
             d2 = dx * dx + dy * dy
-            if d2 < inner * inner:
-                near += cells[a, b]
-            elif d2 < outer * outer:
-                far += cells[a, b]
-    return near, far
-
-
-@njit(cache=True)
-def sides_covered(cells, x, y, inner, outer):
-    """Octants around a position that hold points between `inner` and `outer` m: a canopy is all around its trunk."""
-    i, j = int(4.0 * (x + HALF)), int(4.0 * (y + HALF))
-    k = int(4.0 * outer) + 1
-    covered = np.zeros(8, np.int64)
-    for a in range(max(i - k, 0), min(i + k + 1, CELLS)):
-        for b in range(max(j - k, 0), min(j + k + 1, CELLS)):
-            if cells[a, b] == 0:
+            if d2 >= three:
                 continue
-            dx, dy = 0.25 * (a + 0.5) - HALF - x, 0.25 * (b + 0.5) - HALF - y
-            d2 = dx * dx + dy * dy
-            if inner * inner < d2 < outer * outer:
-                covered[int((np.arctan2(dy, dx) + np.pi) / (2.0 * np.pi) * 7.999)] = 1
-    return covered.sum()
+            octant = 1 << ((dx > 0) * 4 + (dy > 0) * 2 + (abs(dx) > abs(dy)) * 1)
+            if d2 < one:
+                out[0] += c
+            elif d2 < two:
+                out[1] += c
+                inner |= octant
+            else:
+                out[2] += c
+                outer |= octant
+    for bit in range(8):
+        out[3] += (inner >> bit) & 1
+        out[4] += (outer >> bit) & 1
 
 
 @njit(cache=True)
-def find_runs(p, r, a, h, starts, step, low, high, widest):
+def find_runs(p, r, h, starts, eye, step, low, high, widest):
     """Runs (K, RUN_SIZE) and the run (M,) of each point or -1.
 
-    Columns: first and last point, ring, mean xyz (m), mean range, width, free sides, height, count, bearing. A leaf
+    Columns: first and last point, ring, mean xyz (m), mean range, width, free sides, height, count. A leaf
     before a trunk does not end its run: up to three strange returns are passed over.
     """
     n_rings = starts.shape[0] - 1
@@ -92,10 +102,10 @@ def find_runs(p, r, a, h, starts, step, low, high, widest):
             n, last = 1, i
             label[i] = k
             sx, sy, sz = float(p[i, 0]), float(p[i, 1]), float(p[i, 2])
-            sr, sh, sa = float(r[i]), float(h[i]), float(a[i])
+            sr, sh = float(r[i]), float(h[i])
             recent = float(r[i])
             j = i + 1
-            while j < hi and abs(a[j] - a[last]) < max(4.2 * step, 0.1 / r[i]):
+            while j < hi and angle_between(p, r, eye, j, last) < max(4.2 * step, 0.1 / r[i]):
                 if label[j] < 0 and low < h[j] < high and abs(r[j] - recent) < bound:
                     label[j] = k
                     last = j
@@ -106,9 +116,8 @@ def find_runs(p, r, a, h, starts, step, low, high, widest):
                     sz += p[j, 2]
                     sr += r[j]
                     sh += h[j]
-                    sa += a[j]
                 j += 1
-            width = (abs(a[last] - a[i]) + step) * r[i]
+            width = (np.arcsin(min(angle_between(p, r, eye, last, i), 1.0)) + step) * r[i]
             if n < 2 or width > 1.6 * widest or n < 0.4 * width / (step * r[i]) or k >= out.shape[0]:
                 for j in range(i, last + 1):
                     if label[j] == k:
@@ -116,15 +125,15 @@ def find_runs(p, r, a, h, starts, step, low, high, widest):
                 continue
             # A side is free when what is seen beside the run lies behind it (or is nothing).
             mean, free = sr / n, 0.0
-            if i == lo or abs(a[i] - a[i - 1]) > 3.2 * step or r[i - 1] > mean + 0.3:
+            if i == lo or angle_between(p, r, eye, i, i - 1) > 3.2 * step or r[i - 1] > mean + 0.3:
                 free += 1.0
-            if last == hi - 1 or abs(a[last + 1] - a[last]) > 3.2 * step or r[last + 1] > mean + 0.3:
+            if last == hi - 1 or angle_between(p, r, eye, last + 1, last) > 3.2 * step or r[last + 1] > mean + 0.3:
                 free += 1.0
             row = out[k]
             row[FIRST], row[LAST], row[RING] = i, last, ring
             row[PX], row[PY], row[PZ] = sx / n, sy / n, sz / n
             row[RANGE], row[WIDTH], row[FREE] = mean, width, free
-            row[HEIGHT], row[COUNT], row[BEARING] = sh / n, n, sa / n
+            row[HEIGHT], row[COUNT] = sh / n, n
             k += 1
     return out[:k], label
 

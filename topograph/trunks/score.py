@@ -7,14 +7,15 @@ import json
 from importlib import resources
 
 import numpy as np
+from numpy.typing import NDArray
 
 from topograph.geometry import Array
 from topograph.trunks.fit import FEATURES
 
 
 @functools.lru_cache(maxsize=1)
-def weights() -> tuple[Array, ...]:
-    """Mean and deviation of the features, then weights and offsets of the two layers.
+def weights() -> tuple[Array, Array, list[NDArray[np.float32]]]:
+    """Mean and deviation of the features, then weights and offsets of each layer in turn.
 
     Raises:
         ValueError: the file was trained for other features.
@@ -23,14 +24,22 @@ def weights() -> tuple[Array, ...]:
     data = json.loads(text)
     if tuple(data["features"]) != FEATURES:
         raise ValueError("trunks/score.json was trained for other features: run tools/train_score.py")
-    return tuple(np.array(data[k], float) for k in ("mean", "deviation", "w1", "b1", "w2", "b2"))
+    layers = [np.array(v, np.float32) for v in data["layers"]]
+    return np.array(data["mean"]), np.array(data["deviation"]), layers
 
 
 def score(features: Array) -> Array:
     """Log-odds (C,) that candidates with `features` (C, len(FEATURES)) are trees."""
-    mean, deviation, w1, b1, w2, b2 = weights()
-    x = np.clip((features - mean) / deviation, -4.0, 4.0)
-    return np.asarray(np.tanh(x @ w1 + b1) @ w2 + b2)[:, 0]
+    mean, deviation, layers = weights()
+    x = (features - mean) / deviation
+    return forward(np.minimum(np.maximum(x, -4.0), 4.0).astype(np.float32), layers)
+
+
+def forward(x: NDArray[np.float32], layers: list[NDArray[np.float32]]) -> Array:
+    """The network: layers of tanh, the last one linear."""
+    for k in range(0, len(layers) - 2, 2):
+        x = np.tanh(x @ layers[k] + layers[k + 1])
+    return np.asarray(x @ layers[-2] + layers[-1], float)[:, 0]
 
 
 @functools.lru_cache(maxsize=1)

@@ -23,8 +23,8 @@ from topograph.evaluate.truth import Truth
 from topograph.geometry import Array, interpolate, inverse, transform
 from topograph.motion import StreamsBuilder, twist_during
 from topograph.trunks.config import TrunksConfig
-from topograph.trunks.detector import RANGE_EDGES, candidates
-from topograph.trunks.fit import FEATURES
+from topograph.trunks.detector import candidates
+from topograph.trunks.fit import FEATURES, RANGE_EDGES
 from topograph.trunks.score import forward
 
 HIDDEN = (48, 24)
@@ -134,7 +134,7 @@ def train(X: Array, y: Array, epochs: int = 40, batch: int = 512, rate: float = 
 
 
 def main(train_dir: Path, validation_dir: Path) -> None:
-    X, y, fits, errors = collect(train_dir, 3)
+    X, y, fits, errors = collect(train_dir, 2)
     mean, deviation = X.mean(0), X.std(0) + 1e-6
     sure = np.isfinite(y)  # pieces beside a trunk are neither
     X, y, fits, errors = X[sure], y[sure], fits[sure], errors[sure]

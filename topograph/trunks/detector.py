@@ -13,12 +13,11 @@ from topograph.bags import Scan, Trunks
 from topograph.geometry import Array
 from topograph.trunks import score as scoring
 from topograph.trunks.config import TrunksConfig
-from topograph.trunks.fit import FEATURES, OUT_SIZE, fit_chains, gather, merge_stems, suppress
+from topograph.trunks.fit import FEATURES, OUT_SIZE, covariances, fit_chains, gather, merge_stems, suppress
 from topograph.trunks.ground import fit_ground
 from topograph.trunks.organise import angular_step, organise, rings_of
 from topograph.trunks.runs import RUN_SIZE, find_runs, heights, link
 
-RANGE_EDGES = (5.0, 10.0, 20.0)
 _NO_TIME = np.zeros(0, np.float32)
 
 
@@ -36,13 +35,13 @@ class Candidates:
     name: NDArray[np.int64]
     points: NDArray[np.float32]
     runs: Array
-    label: NDArray[np.int64]
+    label: NDArray[np.int32]
     chain: NDArray[np.int64]
 
 
 _NOTHING = Candidates(
     np.zeros((0, OUT_SIZE)), np.zeros((0, len(FEATURES))), np.zeros(0, np.int64), np.zeros((0, 3), np.float32),
-    np.zeros((0, RUN_SIZE)), np.zeros(0, np.int64), np.zeros(0, np.int64),
+    np.zeros((0, RUN_SIZE)), np.zeros(0, np.int32), np.zeros(0, np.int64),
 )  # fmt: skip
 
 
@@ -95,7 +94,7 @@ class Detector:
         rows, ends = gather(wanted, len(best), c.chain, c.runs, c.label)
         clouds = tuple(c.points[rows[a:b]] for a, b in pairwise(ends.tolist()))
         return Trunks(
-            scan.stamp_ns, "base_link", merged[:, :3], merged[:, 3:6], merged[:, 6], _covariance(merged), merged[:, 7],
+            scan.stamp_ns, "base_link", merged[:, :3], merged[:, 3:6], merged[:, 6], covariances(merged, *scoring.calibration()), merged[:, 7],
             odds[best], clouds,
         )  # fmt: skip
 
@@ -104,20 +103,6 @@ def none_at(stamp_ns: int) -> Trunks:
     """No trunks."""
     z = np.zeros(0)
     return Trunks(stamp_ns, "base_link", np.zeros((0, 3)), np.zeros((0, 3)), z, np.zeros((0, 3, 3)), z, z)
-
-
-def _covariance(fits: Array) -> Array:
-    """Covariances (N, 3, 3) turned from the line of sight into the base's axes, with the calibration by range."""
-    radial_factor, tangential_factor = scoring.calibration()
-    cls = np.searchsorted(RANGE_EDGES, fits[:, 13])
-    line = np.zeros((len(fits), 3))
-    line[:, :2] = fits[:, 14:16]
-    side = np.stack([-line[:, 1], line[:, 0], line[:, 2]], axis=1)
-    directions = np.stack([line, side, fits[:, 3:6]], axis=2)
-    variance = np.stack(
-        [(fits[:, 8] * radial_factor[cls]) ** 2, (fits[:, 9] * tangential_factor[cls]) ** 2, np.full(len(fits), 0.12**2)], axis=1
-    )  # fmt: skip
-    return np.asarray((directions * variance[:, None]) @ np.swapaxes(directions, 1, 2) + 1e-6 * np.eye(3))
 
 
 @lru_cache(maxsize=1)

@@ -30,6 +30,10 @@ OUT_SIZE = 16
 """x, y, z, axis (3), diameter, height, radial and tangential sigma, lean sigma, points, rings, range, bearing x, y."""
 
 
+RANGE_EDGES = (5.0, 10.0, 20.0)
+"""Classes of range that covariances are calibrated in, m."""
+
+
 @njit(cache=True)
 def vertical(runs, chain, most):
     """Which way trunks grow, as horizontal metres per metre of height (2,), in the base's frame: the median lean of what
@@ -319,3 +323,24 @@ def gather(wanted, n_groups, chain, runs, label):
                 out[fill[g]] = m
                 fill[g] += 1
     return out, ends
+
+
+@njit(cache=True)
+def covariances(fits, radial_factor, tangential_factor):
+    """Covariances (N, 3, 3) turned from the line of sight into the base's axes, with the calibration by range."""
+    n = fits.shape[0]
+    out = np.zeros((n, 3, 3))
+    for i in range(n):
+        cls = 0
+        while cls < 3 and fits[i, 13] >= RANGE_EDGES[cls]:
+            cls += 1
+        radial, tangential = (fits[i, 8] * radial_factor[cls]) ** 2, (fits[i, 9] * tangential_factor[cls]) ** 2
+        c, s = fits[i, 14], fits[i, 15]
+        out[i, 0, 0] = radial * c * c + tangential * s * s
+        out[i, 1, 1] = radial * s * s + tangential * c * c
+        out[i, 0, 1] = out[i, 1, 0] = (radial - tangential) * c * s
+        for a in range(3):
+            out[i, a, a] += 1e-6
+            for b in range(3):
+                out[i, a, b] += 0.12**2 * fits[i, 3 + a] * fits[i, 3 + b]
+    return out

@@ -39,7 +39,11 @@ def rings_of(scan: Scan) -> tuple[NDArray[np.int32], int]:
     return ring, len(split) + 1
 
 
-@njit(cache=True)
+FAST = {"contract", "reassoc", "arcp", "nsz"}
+"""Liberties with floating point that keep the meaning of NaN."""
+
+
+@njit(cache=True, fastmath=FAST)
 def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
     """Points in ring order: base-frame xyz (M, 3), horizontal range from the sensor (M,), ring starts (R+1,), the tangent
     of the highest ring's elevation, and the lowest point (2 HALF, 2 HALF) of each ground cell.
@@ -56,13 +60,15 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
     timed = offset.shape[0] == n
     count = np.zeros(n_rings + 1, np.int64)
     near2, far2 = np.float32(near * near), np.float32(far * far)
-    inside = np.zeros(n, np.bool_)
+    inside = np.empty(n, np.bool_)
     for i in range(n):
         x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
         d2 = x * x + y * y + z * z
+        inside[i] = (d2 > near2) & (d2 < far2)  # NaN compares false
+    for i in range(n):
         k = ring[i]
-        if near2 < d2 < far2 and 0 <= k < n_rings:  # NaN compares false
-            inside[i] = True
+        inside[i] &= (k >= 0) & (k < n_rings)
+        if inside[i]:
             count[k + 1] += 1
     for k in range(n_rings):
         count[k + 1] += count[k]
@@ -71,7 +77,6 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
     p = np.empty((m, 3), np.float32)
     r = np.empty(m, np.float32)
     fill = count[:-1].copy()
-    rise, flat = np.zeros(n_rings), np.zeros(n_rings)
     low = np.full((2 * HALF, 2 * HALF), 1e9, np.float32)
     for i in range(n):
         if not inside[i]:
@@ -80,8 +85,6 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
         k = fill[g]
         fill[g] = k + 1
         x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-        rise[g] += z
-        flat[g] += np.sqrt(x * x + y * y)
         bx = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + tx
         by = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + ty
         bz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + tz
@@ -105,20 +108,23 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
             continue
         # Firing order is azimuth order but for the place where the turn closes; anything else is sorted.
         up, down = 0, 0
-        for i in range(lo + 1, hi):
+        for i in range(lo + 1, hi, 3):
             side = (p[i - 1, 0] - tx) * (p[i, 1] - ty) - (p[i - 1, 1] - ty) * (p[i, 0] - tx)
             if side < 0:
                 down += 1
             elif side > 0:
                 up += 1
-        if min(up, down) > 2 + (hi - lo) // 200:
+        if min(up, down) > 1 + (hi - lo) // 600:
             order = np.argsort(np.arctan2(p[lo:hi, 1] - ty, p[lo:hi, 0] - tx))
             p[lo:hi] = p[lo:hi][order]
             r[lo:hi] = r[lo:hi][order]
     top = 0.26
     for k in range(n_rings - 1, -1, -1):
         if starts[k + 1] - starts[k] > 20:
-            top = rise[k] / flat[k]
+            rise = 0.0
+            for i in range(starts[k], starts[k + 1]):
+                rise += (p[i, 2] - tz) / max(r[i], np.float32(0.1))
+            top = rise / (starts[k + 1] - starts[k])
             break
     return p, r, starts, top, low
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from topograph.trunks.organise import HALF, angle_between
+from topograph.trunks.organise import FAST, HALF, angle_between
 
 # Columns of a run.
 FIRST, LAST, RING, PX, PY, PZ, RANGE, WIDTH, FREE, HEIGHT, COUNT = range(11)
@@ -16,7 +16,7 @@ CELLS = 8 * HALF
 """Cells of 0.25 m across the grids of canopy and undergrowth."""
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=FAST)
 def heights(p, plane, grid):
     """Height above ground (M,) of points; counts of what is overhead (1.9-5 m) and beside (0.3-1.5 m) per 0.25 m cell."""
     m = p.shape[0]
@@ -91,7 +91,7 @@ def find_runs(p, r, h, starts, eye, step, low, high, widest):
     n_rings = starts.shape[0] - 1
     m = p.shape[0]
     out = np.empty((max(m // 2, 1), RUN_SIZE), np.float64)
-    label = np.full(m, -1, np.int64)
+    label = np.full(m, -1, np.int32)
     k = 0
     for ring in range(n_rings):
         lo, hi = starts[ring], starts[ring + 1]

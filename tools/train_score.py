@@ -23,9 +23,9 @@ from topograph.evaluate.truth import Truth
 from topograph.geometry import Array, interpolate, inverse, transform
 from topograph.motion import StreamsBuilder, twist_during
 from topograph.trunks.config import TrunksConfig
-from topograph.trunks.detector import candidates
+from topograph.trunks.detector import Detector, candidates
 from topograph.trunks.fit import FEATURES, RANGE_EDGES
-from topograph.trunks.score import forward
+from topograph.trunks.score import calibration, forward, weights
 
 HIDDEN = (48, 24)
 
@@ -96,6 +96,41 @@ def collect(folder: Path, every: int) -> tuple[Array, Array, Array, Array]:
     return X, y, fits, errors
 
 
+def normalised(bag: Path, every: int = 8) -> Array:
+    """Range class, radial and tangential error over their stated deviations (N, 3) of what the detector gives."""
+    truth = Truth.load(bag.with_name(bag.stem + ".truth"))
+    out = []
+    with Recording([bag]) as r:
+        builder, pending, n = StreamsBuilder(), [], 0
+        imu = r.frames.get("imu_link")[:3, :3]
+        detect = Detector(r.frames.get("velodyne"), TrunksConfig())
+        for _, m in r.messages():
+            if not isinstance(m, Scan):
+                builder.add(m)
+                continue
+            pending.append(m)
+            if len(pending) < 2:
+                continue
+            scan = pending.pop(0)
+            n += 1
+            if n % every:
+                continue
+            twist, _ = twist_during(scan.stamp_ns - 100_000_000, scan.stamp_ns, builder.odometry, builder.imu, imu)
+            trunks = detect(scan, twist)
+            T = inverse(interpolate(truth.stamps_ns, truth.world_T_robot, scan.stamp_ns)[0])
+            foot, axis = transform(T, truth.trees), truth.axes @ T[:3, :3].T
+            for p, cov in zip(trunks.p, trunks.cov, strict=True):
+                e = p[:2] - foot[:, :2] - ((p[2] - foot[:, 2]) / axis[:, 2])[:, None] * axis[:, :2]
+                j = int(np.argmin(np.hypot(*e.T)))
+                if np.hypot(*e[j]) < 0.3 and truth.stems[j] == 1:
+                    reach = np.hypot(*p[:2])
+                    line = p[:2] / reach
+                    side = np.array([-line[1], line[0]])
+                    C = cov[:2, :2]
+                    out.append([np.searchsorted(RANGE_EDGES, reach), e[j] @ line / np.sqrt(line @ C @ line), e[j] @ side / np.sqrt(side @ C @ side)])  # fmt: skip
+    return np.array(out).reshape(-1, 3)
+
+
 def train(X: Array, y: Array, epochs: int = 40, batch: int = 512, rate: float = 2e-3) -> tuple[list[Array], float]:
     """Weights and offsets of the layers in turn, by Adam (Kingma & Ba 2015) on the log loss; the rate falls as a cosine."""
     rng = np.random.default_rng(0)
@@ -153,26 +188,24 @@ def main(train_dir: Path, validation_dir: Path) -> None:
         "bias",
         (X[one, 3] - fits[one, 6] + errors[one, 3]).mean().round(4),
     )
-    good = (y > 0) & (z > 0) & (errors[:, 2] == 1)
-    cls = np.searchsorted(RANGE_EDGES, fits[:, 13])
-    factor = np.ones((2, 4))
-    for c in range(4):
-        m = good & (cls == c)
-        for k in (0, 1):
-            # 1.4826 m.a.d. and the deviation differ where tails are heavy; the mean of both serves gate and estimate.
-            e = errors[m, k] / fits[m, 8 + k]
-            factor[k, c] = 0.5 * (np.sqrt(np.mean(np.clip(e, -4, 4) ** 2)) + 1.4826 * np.median(np.abs(e)))
-        print(f"class {c}: n {m.sum()}, radial {errors[m, 0].mean():+.3f} ± {errors[m, 0].std():.3f}, "
-              f"tangential {errors[m, 1].std():.3f}, diameter {errors[m, 3].mean():+.3f} ± {errors[m, 3].std():.3f}, "
-              f"factors {factor[:, c].round(2)}")  # fmt: skip
     out = Path(__file__).parent.parent / "topograph" / "trunks" / "score.json"
     data = {
         "trained_by": "tools/train_score.py",
         "features": list(FEATURES),
         **{k: np.round(v, 5).tolist() for k, v in
-           {"mean": mean, "deviation": deviation, "radial_factor": factor[0], "tangential_factor": factor[1]}.items()},
+           {"mean": mean, "deviation": deviation, "radial_factor": np.ones(4), "tangential_factor": np.ones(4)}.items()},
         "layers": [np.round(v.astype(float), 5).tolist() for v in w],
     }  # fmt: skip
+    out.write_text(json.dumps(data) + "\n")
+    weights.cache_clear()
+    calibration.cache_clear()
+    with ProcessPoolExecutor(2) as pool:
+        bags = list(pool.map(normalised, sorted(train_dir.glob("*.bag"))))
+    # The median over bags: an orchard that is harder than the others does not make all others too cautious.
+    for k, name in enumerate(("radial_factor", "tangential_factor")):
+        rms = [[np.sqrt(np.mean(e[e[:, 0] == c, 1 + k] ** 2)) for c in range(4)] for e in bags]
+        data[name] = np.round(np.median(rms, axis=0), 3).tolist()
+        print(name, data[name])
     out.write_text(json.dumps(data) + "\n")
     Xv, yv, _, _ = collect(validation_dir, 4)
     Xv, yv = Xv[np.isfinite(yv)], yv[np.isfinite(yv)]

@@ -16,7 +16,7 @@ from topograph.localize import LocalizeConfig, ThesisConfig
 from topograph.motion import MotionConfig
 from topograph.topomap import TopomapConfig
 from topograph.trees import TreesConfig
-from topograph.trunks import TrunksConfig
+from topograph.trunks import ThesisTrunksConfig, TrunksConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +31,7 @@ class Config:
     topomap: TopomapConfig = field(default_factory=TopomapConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
     thesis: ThesisConfig = field(default_factory=ThesisConfig)
+    thesis_trunks: ThesisTrunksConfig = field(default_factory=ThesisTrunksConfig)
 
 
 class _Loader(yaml.SafeLoader):

@@ -54,6 +54,10 @@ def input_options(f: _F) -> _F:
         f = click.option(f"--topic-{kind}", default=None, metavar="TOPIC", help=f"Topic of {kind}; 'none' ignores it.")(
             f
         )
+    f = click.option(
+        "--front-end", type=click.Choice(["organised", "thesis"]), default=None,
+        help="How trunks are found: ours (organised), or the thesis's pipeline (Algorithms 1-2) to compare with.",
+    )(f)  # fmt: skip
     f = click.option("--base-frame", default=None, help="Frame whose poses are estimated (base_link).")(f)
     f = click.option(
         "--extrinsic", multiple=True, metavar="FRAME=X,Y,Z,R,P,Y",
@@ -71,6 +75,8 @@ def config_of(config_file: Path | None, words: dict[str, Any]) -> Any:
     for kind in _TOPICS:
         if words.get(f"topic_{kind}"):
             overrides[f"bags.topic_{kind}"] = words[f"topic_{kind}"]
+    if words.get("front_end"):
+        overrides["trunks.front_end"] = words["front_end"]
     if words.get("base_frame"):
         overrides["bags.base_frame"] = words["base_frame"]
     mounts = {}

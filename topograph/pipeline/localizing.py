@@ -77,7 +77,7 @@ def localize_bags(
         localizer: Localizer | None = None
         buffer: list[Imu | Odometry] = []
         stretch = _Stretch()
-        for m in stream(recording, config.trunks, partial(_show, progress), span_s):
+        for m in stream(recording, config, partial(_show, progress), span_s):
             if isinstance(m, (Imu, Odometry)):
                 buffer.append(m)
             elif isinstance(m, Trunks):

@@ -15,7 +15,7 @@ from topograph.config import Config
 from topograph.errors import InputError
 from topograph.geometry import Array, inverse
 from topograph.motion import Streams, StreamsBuilder, twist_during
-from topograph.trunks import TrunksConfig, from_recorded
+from topograph.trunks import from_recorded
 
 Progress = Callable[[str, float], None]
 WHOLE = (0.0, float("inf"))
@@ -52,7 +52,7 @@ class Run:
 
 
 def stream(
-    recording: Recording, config: TrunksConfig, progress: Progress = silent, span_s: tuple[float, float] = WHOLE
+    recording: Recording, config: Config, progress: Progress = silent, span_s: tuple[float, float] = WHOLE
 ) -> Iterator[Trunks | Imu | Odometry | Fix | Heading]:
     """The small messages as they come, and the trunks of each scan as soon as the motion during it is known.
 
@@ -73,7 +73,7 @@ def stream(
         if isinstance(product, Scan):
             pending.append(product)
         elif isinstance(product, Trunks):
-            yield from_recorded(product, recording.frames.get(product.frame), config)
+            yield from_recorded(product, recording.frames.get(product.frame), config.trunks)
         else:
             builder.add(product)
             yield product
@@ -98,7 +98,7 @@ def read_run(
     with Recording(paths, config.bags) as recording:
         builder = StreamsBuilder()
         trunks: list[Trunks] = []
-        for product in stream(recording, config.trunks, progress, span_s):
+        for product in stream(recording, config, progress, span_s):
             if isinstance(product, Trunks):
                 trunks.append(product)
             else:
@@ -139,15 +139,20 @@ def child_mount(recording: Recording, child: str, config: Config, notes: list[st
     return inverse(base_T_child)
 
 
-def _detector(recording: Recording, config: TrunksConfig) -> Callable[[Scan, StreamsBuilder], Trunks]:
+def _detector(recording: Recording, config: Config) -> Callable[[Scan, StreamsBuilder], Trunks]:
     """Scan -> trunks in the base's frame, deskewed with what the small streams said around the scan."""
     from topograph.trunks.detector import Detector
+    from topograph.trunks.thesis import ThesisDetector
 
-    detectors: dict[str, Detector] = {}
+    detectors: dict[str, Detector | ThesisDetector] = {}
 
     def detect(scan: Scan, streams: StreamsBuilder) -> Trunks:
         if scan.frame not in detectors:
-            detectors[scan.frame] = Detector(recording.frames.get(scan.frame), config)
+            base_T_lidar = recording.frames.get(scan.frame)
+            if config.trunks.front_end == "thesis":
+                detectors[scan.frame] = ThesisDetector(base_T_lidar, config.thesis_trunks)
+            else:
+                detectors[scan.frame] = Detector(base_T_lidar, config.trunks)
         robot_R_imu = None
         if streams.imu:
             mount = recording.frames.find(streams.imu[0].frame)

@@ -37,7 +37,9 @@ def exists(
     enough = hits >= max(config.min_sightings, config.min_share * typical)
     ratio = found / np.maximum(shown, 1)
     scored = bool(np.any(detections.score != 0.0))  # recorded detections may come without
-    ok = enough & ((score >= config.min_score) | (not scored)) & ((ratio >= config.min_ratio) | (shown < 4))
+    # Scores differ between sensors and orchards: what counts is also how this run's own trees score.
+    usual = float(np.median(score[enough])) if enough.any() else 0.0
+    ok = enough & ((score >= min(config.min_score, config.usual_score * usual)) | (not scored)) & ((ratio >= config.min_ratio) | (shown < 4))
     return ok, score, hits, shown
 
 

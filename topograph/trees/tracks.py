@@ -28,6 +28,7 @@ class TreesConfig:
         margin: log-odds by which a loop must beat its rivals and the absence of a loop.
         merge: two trees nearer than this are one (stems of one tree), m.
         min_sightings, min_score, min_ratio: of a tree that exists; ratio of sightings to scans that should show it;
+        usual_score: share of the run's median score that is enough;
         min_share: of the sightings that trees of the same run have at the median.
     """
 
@@ -41,7 +42,8 @@ class TreesConfig:
     margin: float = 7.0
     merge: float = 0.7
     min_sightings: int = 6
-    min_score: float = 1.35
+    min_score: float = 2.3
+    usual_score: float = 0.45
     min_ratio: float = 0.15
     min_share: float = 0.03
 

@@ -2,5 +2,6 @@
 
 from topograph.trunks.config import TrunksConfig
 from topograph.trunks.recorded import from_recorded
+from topograph.trunks.thesis import ThesisTrunksConfig
 
-__all__ = ["TrunksConfig", "from_recorded"]
+__all__ = ["ThesisTrunksConfig", "TrunksConfig", "from_recorded"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True, slots=True)
@@ -10,6 +11,7 @@ class TrunksConfig:
     """The front end; lengths in m.
 
     Attributes:
+        front_end: "organised" (ours) or "thesis".
         nearest, farthest: distances between which trunks are looked for.
         low, high: heights above ground between which a trunk is traced.
         reference: height above ground at which the axis is stated.
@@ -22,6 +24,7 @@ class TrunksConfig:
         recorded_reach: recorded detections beyond are left out.
     """
 
+    front_end: Literal["organised", "thesis"] = "organised"
     nearest: float = 0.8
     farthest: float = 30.0
     low: float = 0.25

@@ -1,0 +1,27 @@
+"""The one place where open3d is imported: late, for it takes long, and with the library that bare systems lack."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import logging
+from typing import Any
+
+log = logging.getLogger(__name__)
+
+
+@functools.lru_cache(maxsize=1)
+def open3d() -> Any:
+    """The open3d module. Where Debian lacks libusb-1.0, PyPI's copy of it is loaded first."""
+    try:
+        import libusb_package
+
+        path = libusb_package.get_library_path()
+        if path is not None:
+            ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+    except (ImportError, OSError):  # elsewhere than on Linux open3d needs no help
+        log.debug("libusb_package is not to be had")
+    import open3d as o3d
+
+    o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
+    return o3d

@@ -131,6 +131,11 @@ def normalised(bag: Path, every: int = 8) -> Array:
     return np.array(out).reshape(-1, 3)
 
 
+def _rms(e: Array) -> float:
+    """Root mean square of enough values; NaN of fewer."""
+    return float(np.sqrt(np.mean(e**2))) if len(e) >= 30 else np.nan
+
+
 def train(X: Array, y: Array, epochs: int = 40, batch: int = 512, rate: float = 2e-3) -> tuple[list[Array], float]:
     """Weights and offsets of the layers in turn, by Adam (Kingma & Ba 2015) on the log loss; the rate falls as a cosine."""
     rng = np.random.default_rng(0)
@@ -203,8 +208,8 @@ def main(train_dir: Path, validation_dir: Path) -> None:
         bags = list(pool.map(normalised, sorted(train_dir.glob("*.bag"))))
     # The median over bags: an orchard that is harder than the others does not make all others too cautious.
     for k, name in enumerate(("radial_factor", "tangential_factor")):
-        rms = [[np.sqrt(np.mean(e[e[:, 0] == c, 1 + k] ** 2)) for c in range(4)] for e in bags]
-        data[name] = np.round(np.median(rms, axis=0), 3).tolist()
+        rms = [[_rms(e[e[:, 0] == c, 1 + k]) for c in range(4)] for e in bags]
+        data[name] = np.round(np.nanmedian(rms, axis=0), 3).tolist()
         print(name, data[name])
     out.write_text(json.dumps(data) + "\n")
     Xv, yv, _, _ = collect(validation_dir, 4)

@@ -11,9 +11,12 @@ from topograph.config import Config
 from topograph.evaluate import Truth, trunk_metrics
 from topograph.geometry import exp
 from topograph.pipeline import read_run
-from topograph.trunks import TrunksConfig
+from topograph.trunks import ThesisTrunksConfig, TrunksConfig
 from topograph.trunks.detector import Detector, candidates
+from topograph.trunks.fit import vertical
 from topograph.trunks.organise import rings_of
+from topograph.trunks.runs import COUNT, PX, PY, PZ, RUN_SIZE
+from topograph.trunks.thesis import ThesisDetector
 
 MOUNT = np.eye(4)
 MOUNT[2, 3] = 0.8
@@ -136,3 +139,66 @@ def test_detection_is_a_pure_function(lidar_run: tuple[Path, Truth]) -> None:
     for scan in scans:
         b(scans[0], np.zeros(6))
         np.testing.assert_array_equal(a(scan, np.zeros(6)).p, b(scan, np.zeros(6)).p)
+
+
+def test_several_processes_find_the_same(lidar_run: tuple[Path, Truth]) -> None:
+    """Bit for bit: what a sweep shows does not depend on where reading began."""
+    one, two = (read_run([lidar_run[0]], Config(), jobs=jobs) for jobs in (1, 2))
+    assert len(one.trunks) == len(two.trunks) > 50
+    for a, b in zip(one.trunks, two.trunks, strict=True):
+        assert a.stamp_ns == b.stamp_ns
+        for name in ("p", "axis", "diameter", "cov", "height", "score"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    np.testing.assert_array_equal(one.streams.imu_ns, two.streams.imu_ns)
+
+
+def test_unorganised_clouds_lose_little(lidar_run: tuple[Path, Truth]) -> None:
+    """Without ring field and order, nearly all trunks are still found."""
+    rng = np.random.default_rng(0)
+    with Recording([lidar_run[0]]) as r:
+        scans = [m for n, (_, m) in enumerate(r.messages(["points"])) if n % 10 == 5]
+        detector = Detector(r.frames.get("velodyne"), TrunksConfig())
+    found = again = 0
+    for scan in scans:
+        order = rng.permutation(len(scan.xyz))
+        mixed = Scan(scan.stamp_ns, scan.frame, scan.xyz[order], None, scan.offset[order], None)
+        a, b = detector(scan, np.zeros(6)), detector(mixed, np.zeros(6))
+        found += len(a)
+        if len(b):
+            again += int((np.hypot(*(a.p[:, None, :2] - b.p[None, :, :2]).transpose(2, 0, 1)).min(axis=1) < 0.1).sum())
+    assert found > 30
+    assert again > 0.9 * found
+
+
+@pytest.mark.parametrize("lean", [(0.0, 0.0), (0.15, -0.1)])
+def test_the_vertical_is_what_trunks_agree_on(lean: tuple[float, float]) -> None:
+    """On a slope the base is tilted against the trees; a few crooked ones do not matter."""
+    rng = np.random.default_rng(2)
+    runs, chain = [], []
+    for tree in range(12):
+        x, y = rng.uniform(-15, 15, 2)
+        crooked = rng.normal(0, 0.4, 2) if tree < 2 else rng.normal(0, 0.03, 2)
+        for k in range(5):
+            row = np.zeros(RUN_SIZE)
+            z = 0.3 + 0.3 * k
+            row[[PX, PY, PZ, COUNT]] = x + (lean[0] + crooked[0]) * z, y + (lean[1] + crooked[1]) * z, z, 8
+            chain.append(5 * tree)
+            runs.append(row)
+    up = vertical(np.array(runs), np.array(chain), 64)
+    np.testing.assert_allclose(up, np.array(lean) * 12 / 14, atol=0.03)
+
+
+def test_the_thesis_front_end_finds_a_bare_trunk() -> None:
+    """Its centroid lies on the surface that is seen, a radius before the axis."""
+    scene = cylinder_scene(64, 5.0, 1.0, 0.4)
+    rng = np.random.default_rng(0)
+    noisy = replace(scene, xyz=(scene.xyz + rng.normal(0, 0.01, scene.xyz.shape)).astype(np.float32))
+    found = ThesisDetector(MOUNT, ThesisTrunksConfig(cluster_max=5000))(noisy, np.zeros(6))
+    assert found.surface
+    d = np.hypot(found.p[:, 0] - 5.0, found.p[:, 1] - 1.0)
+    assert 0.05 < d.min() < 0.25
+    for cloud in (np.zeros((0, 3)), np.full((100, 3), np.nan), np.zeros((100, 3))):
+        assert (
+            len(ThesisDetector(MOUNT, ThesisTrunksConfig())(replace(noisy, xyz=cloud.astype(np.float32)), np.zeros(6)))
+            == 0
+        )

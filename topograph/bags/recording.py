@@ -41,6 +41,7 @@ class Recording:
         frames: sensor frames.
         skipped: reason -> count, filled while reading.
         duration_s: from the first to the last message, by recording time.
+        start_ns, log_ns: recording time of the first message, and of the one that was given last.
     """
 
     def __init__(self, paths: Sequence[Path], config: BagsConfig | None = None) -> None:
@@ -52,6 +53,7 @@ class Recording:
         self.types: dict[str, str] = {}
         self.counts: Counter[str] = Counter()
         self.duration_s = 0.0
+        self.start_ns = self.log_ns = 0
         self._readers: list[AnyReader] = []
         self._stack = ExitStack()
 
@@ -106,12 +108,19 @@ class Recording:
                         pose = from_quaternion([x.x, x.y, x.z], [q.x, q.y, q.z, q.w])
                         self.frames.add(t.header.frame_id, t.child_frame_id, pose)
 
-    def messages(self, kinds: Sequence[str] = tuple(topics.KINDS)) -> Iterator[tuple[str, Product]]:
-        """(kind, product) of the chosen streams in order of recording time; what cannot be used is counted."""
+    def messages(
+        self, kinds: Sequence[str] = tuple(topics.KINDS), window_ns: tuple[int, int] | None = None
+    ) -> Iterator[tuple[str, Product]]:
+        """(kind, product) of the chosen streams in order of recording time; what cannot be used is counted.
+
+        `window_ns` (from, to) bounds the time of recording.
+        """
         wanted = {self.chosen[k]: k for k in kinds if k in self.chosen}
         newest: dict[str, int] = {}
-        merged = heapq.merge(*(self._raw(i, set(wanted)) for i in range(len(self._readers))), key=lambda m: m[1])
-        for i, _, connection, raw in merged:
+        merged = heapq.merge(
+            *(self._raw(i, set(wanted), window_ns) for i in range(len(self._readers))), key=lambda m: m[1]
+        )
+        for i, self.log_ns, connection, raw in merged:
             kind = wanted[connection.topic]
             product = self._product(kind, self._readers[i], connection, raw)
             if product is None:
@@ -127,13 +136,16 @@ class Recording:
             newest[kind] = max(last, stamp)
             yield kind, product
 
-    def _raw(self, i: int, names: set[str]) -> Iterator[tuple[int, int, Connection, Any]]:
+    def _raw(
+        self, i: int, names: set[str], window_ns: tuple[int, int] | None
+    ) -> Iterator[tuple[int, int, Connection, Any]]:
         reader = self._readers[i]
         found = [c for c in reader.connections if c.topic in names]
         if not found:
             return
         try:
-            for connection, log_ns, raw in reader.messages(connections=found):
+            start, stop = window_ns or (None, None)
+            for connection, log_ns, raw in reader.messages(connections=found, start=start, stop=stop):
                 yield i, log_ns, connection, raw
         except (AnyReaderError, struct.error, ValueError, EOFError, OSError, RuntimeError) as err:
             self.skipped[f"rest of {self.paths[i].name}: damaged ({err})"] += 1

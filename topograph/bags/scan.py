@@ -52,7 +52,7 @@ def decode(message: Any, stamp_ns: int) -> Scan:
     ring_name = next((names[n] for n in _RING_NAMES if n in names), None)
     ring = None if ring_name is None else view[ring_name].astype(np.int32)
     intensity_name = next((names[n] for n in ("intensity", "i", "reflectivity") if n in names), None)
-    intensity = None if intensity_name is None else view[intensity_name].astype(np.float32)
+    intensity = None if intensity_name is None else np.asarray(view[intensity_name], np.float32)  # no copy: seldom used
     return Scan(stamp_ns, message.header.frame_id.lstrip("/"), xyz, ring, _offsets(view, names, stamp_ns), intensity)
 
 
@@ -95,10 +95,9 @@ def _offsets(view: NDArray[Any], names: dict[str, str], stamp_ns: int) -> NDArra
         if name is None or view[name].ndim > 1:
             return None
         raw = view[name]
-        finite = raw[np.isfinite(raw)] if raw.dtype.kind == "f" else raw
-        if len(finite) < 2:
+        low, high = np.fmin.reduce(raw), np.fmax.reduce(raw)  # NaN is passed over
+        if not (np.isfinite(low) and np.isfinite(high)):
             return None
-        low, high = finite.min(), finite.max()
         span = float(high) - float(low)
         unit = next((u for u in (1.0, 1e-3, 1e-6, 1e-9) if 2e-3 <= span * u <= 2.0), None)
         if unit is None:
@@ -110,6 +109,8 @@ def _offsets(view: NDArray[Any], names: dict[str, str], stamp_ns: int) -> NDArra
             shift = whole - stamp_ns * 1e-9
         else:
             shift = 0.0
+        if raw.dtype == np.float32 and unit == 1.0 and shift == 0.0:
+            return np.ascontiguousarray(raw) if max(abs(float(low)), abs(float(high))) <= 2.0 else None
         if raw.dtype.kind == "f":
             t = (raw.astype(float) - base) * unit + shift
         else:

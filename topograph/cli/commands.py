@@ -37,11 +37,18 @@ from topograph.errors import InputError, UsageError
               help="Withhold every N-th fix from the estimator and report the path's distance from it (1: withhold all).")  # fmt: skip
 @click.option("--from", "from_s", type=float, default=0.0, help="Begin so many seconds into the recording.")
 @click.option("--to", "to_s", type=float, default=float("inf"), help="End there.")
+@click.option(
+    "--jobs",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Processes that detect; the result is the same.",
+)
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 @input_options
 def map_command(
     bags: tuple[Path, ...], output: Path | None, into: Path | None, results: Path | None, truth: Path | None,
-    check_fixes: int, from_s: float, to_s: float, quiet: bool, config_file: Path | None, **words: Any,
+    check_fixes: int, from_s: float, to_s: float, jobs: int, quiet: bool, config_file: Path | None, **words: Any,
 ) -> None:  # fmt: skip
     """Make a map of the trees in BAGS (one run)."""
     from topograph import pipeline, store
@@ -56,7 +63,7 @@ def map_command(
     if target.suffix != ".gpkg":
         raise UsageError(f"{target}: a map is a GeoPackage; end its name in .gpkg")
     with progress_bar(quiet) as progress:
-        run = pipeline.read_run(bags, config, progress, (from_s, to_s))
+        run = pipeline.read_run(bags, config, progress, (from_s, to_s), jobs)
         solved = pipeline.solve_run(run, config, check_fixes=check_fixes, known=old, progress=progress)
         topo = _save_results(solved, config, bags, folder, target, true, old, progress)
     no_trees = pipeline.why_no_trees(solved)
@@ -220,11 +227,18 @@ def inspect(bags: tuple[Path, ...], config_file: Path | None, **words: Any) -> N
     help="Folder of simulated truth: precision and recall by range.",
 )
 @click.option("--results", type=click.Path(path_type=Path), help="Folder for report.json.")
+@click.option(
+    "--jobs",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Processes that detect; the result is the same.",
+)
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 @input_options
 def detect(
     bags: tuple[Path, ...], csv_file: Path | None, picture: Path | None, at_s: float | None, truth: Path | None,
-    results: Path | None, quiet: bool, config_file: Path | None, **words: Any,
+    results: Path | None, jobs: int, quiet: bool, config_file: Path | None, **words: Any,
 ) -> None:  # fmt: skip
     """Find trunks in the scans of BAGS: counts, rate, a table by range, a picture."""
     from topograph import pipeline, report
@@ -235,7 +249,7 @@ def detect(
     config = config_of(config_file, words)
     true = truth_of(truth)
     with progress_bar(quiet) as progress:
-        run = pipeline.read_run(bags, config, progress)
+        run = pipeline.read_run(bags, config, progress, jobs=jobs)
     if run.scans == 0:
         raise InputError("no point cloud and no trunk detections; name a topic with --topic-points or --topic-trunks")
     trunks = sorted(run.trunks, key=lambda t: t.stamp_ns)

@@ -5,7 +5,10 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -85,9 +88,15 @@ def stream(
 
 
 def read_run(
-    paths: Sequence[Path], config: Config, progress: Progress = silent, span_s: tuple[float, float] = WHOLE
+    paths: Sequence[Path],
+    config: Config,
+    progress: Progress = silent,
+    span_s: tuple[float, float] = WHOLE,
+    jobs: int = 1,
 ) -> Run:
     """Read a run (or `span_s` of it) once: small streams into arrays, scans into trunks as they come.
+
+    With several `jobs`, each process detects in its part of the recording; the result is the same, bit for bit.
 
     Raises:
         InputError: nothing usable in the bags.
@@ -98,11 +107,14 @@ def read_run(
     with Recording(paths, config.bags) as recording:
         builder = StreamsBuilder()
         trunks: list[Trunks] = []
-        for product in stream(recording, config, progress, span_s):
-            if isinstance(product, Trunks):
-                trunks.append(product)
-            else:
-                builder.add(product)
+        if jobs > 1 and "points" in recording.chosen and span_s == WHOLE:
+            trunks = _in_parts(recording, config, jobs, builder, progress)
+        else:
+            for product in stream(recording, config, progress, span_s):
+                if isinstance(product, Trunks):
+                    trunks.append(product)
+                else:
+                    builder.add(product)
         streams = builder.build(recording.skipped)
         mounts: dict[str, Array | None] = {
             k: recording.frames.find(streams.frames[k]) for k in ("imu", "fix", "heading") if k in streams.frames
@@ -128,6 +140,58 @@ def read_run(
         time.perf_counter() - began,
         duration,
     )
+
+
+_LAG_NS = 2_000_000_000
+"""A message is recorded at most this long after its stamp, or it is of no use to a scan of another part."""
+
+
+def _in_parts(
+    recording: Recording, config: Config, jobs: int, builder: StreamsBuilder, progress: Progress
+) -> list[Trunks]:
+    """Trunks of all scans, by several processes; the small streams go into `builder` meanwhile."""
+    edges = np.linspace(recording.start_ns, recording.start_ns + int(recording.duration_s * 1e9) + 1, jobs + 1)
+    edges = edges.astype(np.int64)
+    parts: list[list[Trunks]] = []
+    # Fresh processes: a fork would inherit the locks of the libraries' threads.
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        waiting = [
+            pool.submit(_detect_part, recording.paths, config, int(a), int(b) + (b == edges[-1]))
+            for a, b in pairwise(edges)
+        ]
+        for _, product in recording.messages(("odometry", "imu", "fix", "heading")):
+            assert not isinstance(product, (Scan, Trunks))
+            builder.add(product)
+        for n, part in enumerate(waiting):
+            trunks, skipped = part.result()
+            parts.append(trunks)
+            recording.skipped.update(skipped)
+            progress("read", (n + 1) / jobs)
+    return [t for part in parts for t in part]
+
+
+def _detect_part(
+    paths: Sequence[Path], config: Config, start_ns: int, stop_ns: int
+) -> tuple[list[Trunks], Counter[str]]:
+    """Trunks of the scans recorded from `start_ns` until before `stop_ns`."""
+    out: list[Trunks] = []
+    with Recording(paths, config.bags) as recording:
+        detect = _detector(recording, config)
+        builder = StreamsBuilder()
+        pending: list[Scan] = []
+        newest = 0
+        window = (max(start_ns - _LAG_NS, recording.start_ns), stop_ns + _LAG_NS)
+        for _, product in recording.messages(("points", "odometry", "imu"), window):
+            newest = max(newest, product.stamp_ns)
+            if isinstance(product, Scan):
+                if start_ns <= recording.log_ns < stop_ns:
+                    pending.append(product)
+            elif isinstance(product, (Imu, Odometry)):
+                builder.add(product)
+            while pending and newest > pending[0].stamp_ns + 250_000_000:
+                out.append(detect(pending.pop(0), builder))
+        out += [detect(s, builder) for s in pending]
+        return out, Counter({k: v for k, v in recording.skipped.items() if k.startswith("points")})
 
 
 def child_mount(recording: Recording, child: str, config: Config, notes: list[str]) -> Array:

@@ -39,7 +39,11 @@ def exists(
     scored = bool(np.any(detections.score != 0.0))  # recorded detections may come without
     # Scores differ between sensors and orchards: what counts is also how this run's own trees score.
     usual = float(np.median(score[enough])) if enough.any() else 0.0
-    ok = enough & ((score >= min(config.min_score, config.usual_score * usual)) | (not scored)) & ((ratio >= config.min_ratio) | (shown < 4))
+    ok = (
+        enough
+        & ((score >= min(config.min_score, config.usual_score * usual)) | (not scored))
+        & ((ratio >= config.min_ratio) | (shown < 4))
+    )
     return ok, score, hits, shown
 
 

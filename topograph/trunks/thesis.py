@@ -27,7 +27,8 @@ SURFACE_SIGMA = 0.12
 
 @dataclass(frozen=True, slots=True)
 class ThesisTrunksConfig:
-    """Parameters of Algorithms 1 and 2; lengths in m, angles in degrees. Found on training orchards (grid 100-102) by search.
+    """Parameters of Algorithms 1 and 2; lengths in m, angles in degrees. Found by random search on
+    training orchards (tools/tune_thesis.py: the best of 140 sets by F1).
 
     Attributes:
         z_min, z_max: height interval in the LiDAR's frame; `intensity_min`, `intensity_max` likewise.
@@ -40,21 +41,21 @@ class ThesisTrunksConfig:
         farthest: clusters beyond are left out.
     """
 
-    z_min: float = -0.6
-    z_max: float = 0.1
+    z_min: float = -0.36
+    z_max: float = 0.69
     intensity_min: float = float("-inf")
     intensity_max: float = float("inf")
-    normal_neighbours: int = 10
-    plane_distance: float = 0.2
-    plane_angle: float = 25.0
-    radius: float = 0.3
-    radius_neighbours: int = 6
-    mean_neighbours: int = 10
-    deviations: float = 1.0
-    cluster_distance: float = 0.3
-    cluster_angle: float = 45.0
-    cluster_min: int = 12
-    cluster_max: int = 400
+    normal_neighbours: int = 11
+    plane_distance: float = 0.15
+    plane_angle: float = 38.0
+    radius: float = 0.33
+    radius_neighbours: int = 3
+    mean_neighbours: int = 20
+    deviations: float = 1.66
+    cluster_distance: float = 0.48
+    cluster_angle: float = 52.0
+    cluster_min: int = 8
+    cluster_max: int = 979
     farthest: float = 30.0
 
 

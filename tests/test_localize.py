@@ -1,0 +1,417 @@
+"""Localization: the algebra against numbers, invariances, right or unknown, and the whole chain from bags."""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from topograph import store
+from topograph.bags import Imu, Odometry, Trunks
+from topograph.cli import main
+from topograph.errors import InsufficientDataError
+from topograph.evaluate import Truth, read_tum
+from topograph.geometry import Array, interpolate, to_quaternion
+from topograph.localize import LocalizeConfig, Localizer, ThesisConfig, ThesisMethod
+from topograph.localize.engine import Engine
+from topograph.localize.evidence import describe, weigh
+from topograph.localize.filter import Filter
+from topograph.localize.index import MapIndex, build_index
+from topograph.localize.search import search
+from topograph.localize.submap import Move, Submap, Sweep, Visibility
+from topograph.localize.thesis import multilaterate
+from topograph.motion import Leg, Reckoner
+from topograph.simulate import DESIGNS, DriveConfig, SensorConfig, record
+from topograph.simulate.starts import SCENARIOS, StartsConfig, drive, world
+from topograph.topomap import TopoMap
+
+seeds = st.integers(0, 10_000)
+
+
+def sweep(p: Array, sigma: float = 0.05) -> Sweep:
+    n = len(p)
+    return Sweep(p, np.tile(sigma**2 * np.eye(2), (n, 1, 1)), np.full(n, np.nan), np.full(n, 0.01))
+
+
+def still() -> Move:
+    return Move(np.zeros(3), 1e-10 * np.eye(3), 0.0)
+
+
+def told(c: StartsConfig) -> LocalizeConfig:
+    return LocalizeConfig(
+        view=c.view, map_sigma=c.map_sigma, trunk_sigma=0.0, seen=1 - c.miss, clutter=c.clutter, felled=0.03, new=0.03
+    )
+
+
+def index_of(xy: Array, config: LocalizeConfig) -> MapIndex:
+    return build_index(xy, np.zeros(len(xy)), np.full(len(xy), np.nan), config.view, config.pair, config.map_sigma)
+
+
+# -- the filter ---------------------------------------------------------------------------------------------------
+
+
+@given(seeds)
+@settings(max_examples=30, deadline=None)
+def test_the_filter_is_the_kalman_filter_of_its_model(seed: int) -> None:
+    """Prediction, new landmark and update against the textbook's equations with numerical Jacobians."""
+    rng = np.random.default_rng(seed)
+    f = Filter(2)
+    x, P = np.zeros(3), np.zeros((3, 3))
+
+    def jacobian(g, at):  # type: ignore[no-untyped-def]  # a local helper
+        d = 1e-6
+        return np.stack([(g(at + d * e) - g(at - d * e)) / (2 * d) for e in np.eye(len(at))], axis=1)
+
+    def moved(s: Array, m: Array) -> Array:
+        c, sn = np.cos(s[2]), np.sin(s[2])
+        return np.concatenate([[s[0] + c * m[0] - sn * m[1], s[1] + sn * m[0] + c * m[1], s[2] + m[2]], s[3:]])
+
+    def seen(s: Array, k: int) -> Array:
+        c, sn = np.cos(s[2]), np.sin(s[2])
+        d = s[3 + 2 * k : 5 + 2 * k] - s[:2]
+        return np.array([c * d[0] + sn * d[1], -sn * d[0] + c * d[1]])
+
+    def grown(s: Array, z: Array) -> Array:
+        c, sn = np.cos(s[2]), np.sin(s[2])
+        return np.concatenate([s, [s[0] + c * z[0] - sn * z[1], s[1] + sn * z[0] + c * z[1]]])
+
+    for _ in range(3):
+        m, A = rng.normal(0, 0.5, 3), rng.normal(0, 0.1, (3, 3))
+        Q = A @ A.T
+        n = len(x)
+        F = jacobian(lambda s, m=m: moved(s, m), x)
+        G = jacobian(lambda q, x=x: moved(x, q), m)[:3, :2]
+        noise = np.zeros((n, n))
+        c, sn = np.cos(x[2]), np.sin(x[2])
+        B = np.array([[c, -sn, 0], [sn, c, 0], [0, 0, 1]])
+        noise[:3, :3] = B @ Q @ B.T
+        np.testing.assert_allclose(G[:2], B[:2, :2], atol=1e-6)
+        x, P = moved(x, m), F @ P @ F.T + noise
+        f.predict(m, Q, 0.5)
+        z, R = rng.normal(0, 5, 2), 0.01 * np.diag(rng.uniform(0.5, 2, 2))
+        H = jacobian(lambda s, z=z: grown(s, z), x)
+        Hz = jacobian(lambda q, x=x: grown(x, q), z)
+        x, P = grown(x, z), H @ P @ H.T + Hz @ R @ Hz.T
+        f.add(z, R)
+        k = int(rng.integers(f.n))
+        z = seen(x, k) + rng.normal(0, 0.1, 2)
+        H = jacobian(lambda s, k=k: seen(s, k), x)
+        S = H @ P @ H.T + R
+        m2, logdet = f.innovations(z[None], R[None])
+        v = z - seen(x, k)
+        assert m2[0, k] == pytest.approx(v @ np.linalg.solve(S, v), rel=1e-4)
+        assert logdet[0, k] == pytest.approx(np.log(np.linalg.det(S)), abs=1e-4)
+        K = P @ H.T @ np.linalg.inv(S)
+        x, P = x + K @ v, P - K @ S @ K.T
+        f.update(k, z, R)
+        np.testing.assert_allclose(f.mean, x, atol=1e-5)
+        np.testing.assert_allclose(f.cov, P, atol=1e-5)
+
+
+def test_landmarks_that_go_are_marginalised() -> None:
+    rng = np.random.default_rng(0)
+    f = Filter(2)
+    for p in rng.uniform(-5, 5, (5, 2)):
+        f.add(p, 0.01 * np.eye(2))
+    f.predict(np.array([1.0, 0.0, 0.2]), 0.01 * np.eye(3), 1.0)
+    before, cov = f.mean.copy(), f.cov.copy()
+    keep = np.array([True, False, True, False, True])
+    f.keep(keep)
+    rows = np.array([0, 1, 2, 3, 4, 7, 8, 11, 12])
+    np.testing.assert_array_equal(f.mean, before[rows])
+    np.testing.assert_array_equal(f.cov, cov[np.ix_(rows, rows)])
+
+
+# -- search and evidence ------------------------------------------------------------------------------------------
+
+
+def hunted(trees: Array, seen: Array, config: LocalizeConfig):  # type: ignore[no-untyped-def]  # a local helper
+    index = index_of(trees, config)
+    submap = Submap(config, Visibility(config))
+    for _ in range(3):
+        submap.step(still(), sweep(seen))
+    marks, _ = describe(submap, index, config)
+    return weigh(search(marks, index, config), marks, submap, index, config)
+
+
+@given(seeds, st.floats(-3.0, 3.0), st.floats(-500, 500), st.floats(-500, 500))
+@settings(max_examples=25, deadline=None)
+def test_the_place_is_found_and_follows_the_map(seed: int, yaw: float, x: float, y: float) -> None:
+    """What is seen from a place in scattered trees leads back to it; a map that is moved moves the place and nothing else."""
+    rng = np.random.default_rng(seed)
+    trees = rng.uniform(0, 60, (60, 2))
+    config = LocalizeConfig(view=15.0)
+    place = rng.uniform(20, 40, 2)
+    near = trees[np.hypot(*(trees - place).T) < 13.0] - place
+    if len(near) < 7:
+        return
+    p = hunted(trees, near, config)
+    np.testing.assert_allclose(p.pose[0, :2], place, atol=0.02)
+    assert abs(p.pose[0, 2]) < 0.005
+    assert p.p.sum() + p.unknown + p.rest == pytest.approx(1.0)
+    c, s = np.cos(yaw), np.sin(yaw)
+    R = np.array([[c, -s], [s, c]])
+    q = hunted(trees @ R.T + [x, y], near, config)
+    np.testing.assert_allclose(q.pose[0, :2], R @ p.pose[0, :2] + [x, y], atol=0.02)
+    turn = (q.pose[0, 2] - p.pose[0, 2] - yaw + np.pi) % (2 * np.pi) - np.pi
+    assert abs(turn) < 0.005
+
+
+def feed(engine: Engine, s, c: StartsConfig):  # type: ignore[no-untyped-def]  # a local helper
+    d = max(s.distance, 1e-9)
+    cov = np.diag([(0.03 * d) ** 2 + 1e-6, (c.white * d) ** 2 + 1e-6, c.wander**2 * d + 1e-8])
+    return engine.step(Move(s.motion, cov, s.distance), sweep(s.p, c.sigma))
+
+
+@pytest.mark.parametrize("name", ["A", "D", "T"])
+def test_commits_are_right(name: str) -> None:
+    """Thirty starts each: found, and where the robot is."""
+    c = SCENARIOS[name]
+    config = told(c)
+    metres = []
+    for seed in range(30):
+        w = world(c, np.random.default_rng([seed, 1]))
+        engine = Engine(index_of(w.mapped, config), config)
+        driven = 0.0
+        for s in drive(w, c, np.random.default_rng([seed, 2]), 25.0):
+            driven += s.distance
+            b = feed(engine, s, c)
+            if b.pose is not None:
+                assert np.hypot(*(b.pose[:2] - s.pose[:2])) < 0.5
+                break
+        metres.append(driven)
+    assert np.mean(metres) < (4.0 if name == "T" else 0.3)
+
+
+def test_a_perfect_lattice_stays_ambiguous() -> None:
+    """Four corners look alike: no commit, and at least the four places are named."""
+    c = replace(SCENARIOS["A"], jitter=0.0, gaps=0.0, felled=0.0, new=0.0)
+    config = told(c)
+    for seed in range(6):
+        w = world(c, np.random.default_rng([seed, 3]))
+        engine = Engine(index_of(w.mapped, config), config)
+        for s in drive(w, c, np.random.default_rng([seed, 4]), 15.0):
+            b = feed(engine, s, c)
+            assert b.pose is None
+        assert b.state == "ambiguous"
+        assert b.hypotheses >= 2
+
+
+def test_another_orchard_is_unknown() -> None:
+    c = SCENARIOS["A"]
+    config = told(c)
+    for seed in range(6):
+        w, v = (world(c, np.random.default_rng([seed, k])) for k in (5, 6))
+        engine = Engine(index_of(w.mapped, config), config)
+        for s in drive(v, c, np.random.default_rng([seed, 7]), 15.0):
+            assert feed(engine, s, c).pose is None
+
+
+@pytest.mark.parametrize("lattice", [False, True])
+def test_a_kidnapped_robot_notices(lattice: bool) -> None:
+    c = SCENARIOS["A"]
+    config = told(c)
+    for seed in range(5):
+        w = world(c, np.random.default_rng([seed, 8]))
+        engine = Engine(index_of(w.mapped, config), config)
+        jump = np.array([c.spacing, -c.row_spacing, 0.0]) if lattice else None
+        driven, right = 0.0, 0
+        for s in drive(w, c, np.random.default_rng([seed, 9]), 22.0, jump_at=10.0, jump=jump):
+            driven += s.distance
+            b = feed(engine, s, c)
+            if driven > 16.0:
+                assert b.pose is None or np.hypot(*(b.pose[:2] - s.pose[:2])) < 0.5
+                right += b.pose is not None
+        assert engine.losses >= 1
+        assert right > 5
+
+
+# -- dead reckoning -----------------------------------------------------------------------------------------------
+
+
+@given(st.floats(0.2, 2.0), st.floats(-0.5, 0.5), st.booleans())
+@settings(max_examples=30, deadline=None)
+def test_reckoning_of_an_arc(speed: float, rate: float, imu: bool) -> None:
+    """A constant twist ends where the closed form says, whichever sensor gives the turn, and however it is cut."""
+    reckoner = Reckoner()
+    pose = np.zeros(3)
+    begin = 10**18
+    for k in range(401):
+        t = 0.01 * k
+        if k % 5 == 0:
+            yaw = rate * t
+            x, y = (np.sin(yaw) / rate, (1 - np.cos(yaw)) / rate) if abs(rate) > 1e-6 else (t, 0.0)
+            q = to_quaternion(np.eye(4))
+            q = np.array([0, 0, np.sin(yaw / 2), np.cos(yaw / 2)]) if yaw else q
+            reckoner.add(
+                Odometry(begin + int(1e9 * t), "base_link", np.array([speed * x, speed * y, 0, *q]), np.zeros(6))
+            )
+        if imu:
+            force = np.array([0.0, speed * rate, 9.80665])
+            reckoner.add(Imu(begin + int(1e9 * t), "imu", np.array([0, 0, rate]), force))
+        if k % 13 == 12 or k == 400:
+            leg = reckoner.advance(begin + int(1e9 * t))
+            c, s = np.cos(pose[2]), np.sin(pose[2])
+            pose += [c * leg.step[0] - s * leg.step[1], s * leg.step[0] + c * leg.step[1], leg.step[2]]
+            assert leg.gyro == (imu and k > 2)
+    yaw = 4.0 * rate
+    end = np.array([np.sin(yaw) / rate, (1 - np.cos(yaw)) / rate]) if abs(rate) > 1e-6 else np.array([4.0, 0.0])
+    np.testing.assert_allclose(pose[:2], speed * end, atol=0.03 * speed + 0.02 if imu else 0.002)
+    assert pose[2] == pytest.approx(yaw, abs=0.02)
+
+
+# -- the thesis's method ------------------------------------------------------------------------------------------
+
+
+@given(seeds)
+@settings(max_examples=40, deadline=None)
+def test_multilateration_of_exact_ranges(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    beacons = rng.uniform(-10, 10, (4, 2))
+    place, yaw = rng.uniform(-5, 5, 2), rng.uniform(-3, 3)
+    c, s = np.cos(yaw), np.sin(yaw)
+    found = multilaterate((beacons - place) @ np.array([[c, -s], [s, c]]), beacons)
+    np.testing.assert_allclose(found[:2], place, atol=1e-3)
+    assert abs((found[2] - yaw + np.pi) % (2 * np.pi) - np.pi) < 1e-3
+
+
+def plain_map(xy: Array) -> TopoMap:
+    n = len(xy)
+    return TopoMap(
+        None, np.arange(1, n + 1), np.column_stack([xy, np.zeros(n)]), np.tile(1e-4 * np.eye(3), (n, 1, 1)),
+        np.tile([0.0, 0.0, 1.0], (n, 1)), np.full(n, np.nan), np.full(n, np.nan), np.full(n, 9), np.zeros(n),
+        np.full(n, -1), np.zeros((0, 2), np.int64), np.zeros(0), (), np.zeros(0, np.int64), np.zeros((0, 4, 4)),
+        np.zeros((3, 3)),
+    )  # fmt: skip
+
+
+def trunks_at(p: Array, stamp: int) -> Trunks:
+    n = len(p)
+    return Trunks(
+        stamp, "base_link", np.column_stack([p, np.full(n, 0.8)]), np.tile([0.0, 0.0, 1.0], (n, 1)), np.full(n, np.nan),
+        np.tile(1e-3 * np.eye(3), (n, 1, 1)), np.full(n, 0.8), np.ones(n),
+    )  # fmt: skip
+
+
+def test_the_thesis_finds_scattered_trees_and_explodes_in_rows() -> None:
+    rng = np.random.default_rng(1)
+    trees = rng.uniform(0, 30, (20, 2))
+    place = np.array([15.0, 14.0])
+    seen = trees - place
+    leg = Leg(np.zeros(3), 0.0, 0.0, 0.0, 0.0, 0.0, 0.1, True, True, True)
+    method = ThesisMethod(plain_map(trees), ThesisConfig(view=9.0))
+    for k in range(12):
+        report = method.step(trunks_at(seen[np.hypot(*seen.T) < 9.0], k + 1), leg)
+    assert report.fix is not None
+    np.testing.assert_allclose(report.fix.map_T_robot[:2, 3], place, atol=0.05)
+    rows = np.stack(np.meshgrid(np.arange(30) * 4.0, np.arange(30) * 4.0), axis=-1).reshape(-1, 2)
+    method = ThesisMethod(plain_map(rows), ThesisConfig(view=9.0))
+    seen = rows - [58.3, 57.9]
+    method.step(trunks_at(seen[np.hypot(*seen.T) < 9.0], 1), leg)
+    assert method.exploded == 1
+
+
+# -- the door and the whole chain ---------------------------------------------------------------------------------
+
+
+def test_a_map_of_one_tree_is_refused() -> None:
+    with pytest.raises(InsufficientDataError, match="1 trees"):
+        Localizer(plain_map(np.zeros((1, 2))))
+
+
+def test_live_door_gives_poses_and_reports() -> None:
+    """Fed message by message: no pose while nothing is seen, then the right one, then every scan."""
+    rng = np.random.default_rng(3)
+    trees = rng.uniform(0, 40, (30, 2))
+    localizer = Localizer(plain_map(trees))
+    assert localizer.update(trunks_at(np.zeros((0, 2)), 10**18)) is None
+    place = np.array([15.0, 20.0])
+    for k in range(8):
+        stamp = 10**18 + (k + 1) * 500_000_000
+        x = place + [0.4 * k, 0.0]
+        seen = trees - x
+        near = seen[np.hypot(*seen.T) < 15.0]
+        pose = np.array([0.4 * k, 0, 0, 0, 0, 0, 1.0])
+        fix = localizer.update(
+            trunks_at(near + rng.normal(0, 0.02, near.shape), stamp),
+            [Odometry(stamp, "base_link", pose, np.zeros(6))],
+        )
+    assert fix is not None
+    assert localizer.report is not None
+    assert localizer.report.state == "tracking"
+    np.testing.assert_allclose(fix.map_T_robot[:2, 3], x, atol=0.06)
+    assert np.linalg.eigvalsh(fix.cov).min() > 0
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An orchard mapped from run 1, and run 3 (zigzag) of it without GNSS."""
+    folder = tmp_path_factory.mktemp("localize")
+    orchard = replace(DESIGNS["grid"], lean=0.02)
+    sensor = SensorConfig(detections=True, compression="zstd")
+    record(folder / "run1", 4, orchard, DriveConfig(run=1), sensor)
+    record(folder / "run3", 4, orchard, DriveConfig(run=3), replace(sensor, gnss="none"))
+    out = CliRunner().invoke(
+        main, ["map", str(folder / "run1"), "-o", str(folder / "m.gpkg"), "--results", str(folder / "map"), "-q"]
+    )
+    assert out.exit_code == 0, out.output
+    return folder
+
+
+@pytest.mark.parametrize("method", ["graph", "thesis"])
+def test_localize_command(mapped: Path, tmp_path: Path, method: str) -> None:
+    words = [
+        "localize",
+        str(mapped / "m.gpkg"),
+        str(mapped / "run3"),
+        "--results",
+        str(tmp_path),
+        "--method",
+        method,
+        "-q",
+    ]
+    out = CliRunner().invoke(main, [*words, "--truth", str(mapped / "run3.truth")])
+    assert out.exit_code == 0, out.output
+    with (tmp_path / "localization.csv").open() as f:
+        rows = list(csv.DictReader(f))
+    assert list(rows[0])[:12] == [
+        "stamp",
+        "state",
+        "x",
+        "y",
+        "z",
+        "qx",
+        "qy",
+        "qz",
+        "qw",
+        "hypotheses",
+        "risk",
+        "trees",
+    ]
+    stamps, poses = read_tum(tmp_path / "localization.tum")
+    assert len(stamps) == sum(r["x"] != "" for r in rows)
+    assert {r["state"] for r in rows} <= {"searching", "ambiguous", "tracking", "degraded", "lost"}
+    assert (tmp_path / "report.html").stat().st_size > 10_000
+    if method == "graph":
+        truth, topo = Truth.load(mapped / "run3.truth"), store.load(mapped / "m.gpkg")
+        assert topo.datum is not None
+        true = interpolate(truth.stamps_ns, truth.world_T_robot, stamps)
+        at = topo.datum.to_enu(truth.datum.to_geodetic(true[:, :3, 3]))
+        for p in (poses, read_tum(tmp_path / "smoothed.tum")[1]):
+            error = np.hypot(*(p[:, :2, 3] - at[:, :2]).T)
+            assert error.mean() < 0.05
+            assert np.percentile(error, 99) < 0.15
+        assert len(stamps) > 0.9 * len(rows)
+
+
+def test_nothing_to_localize_with(mapped: Path) -> None:
+    runner = CliRunner()
+    out = runner.invoke(main, ["localize", str(mapped / "m.gpkg"), str(mapped / "run3"), "--topic-odometry", "none"])
+    assert out.exit_code == 4
+    assert "--topic-odometry" in out.output
+    out = runner.invoke(main, ["localize", str(mapped / "none.gpkg"), str(mapped / "run3")])
+    assert out.exit_code == 5

@@ -62,7 +62,7 @@ class LocalizeConfig:
     landmarks: int = 40
     forget: float = 40.0
     lost: float = 12.0
-    slip: float = 9.0
+    slip: float = 12.0
     shadow: float = 5.0
     degraded: float = 0.3
     along: float = 0.03

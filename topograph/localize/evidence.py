@@ -23,6 +23,10 @@ from topograph.localize.search import Found, Landmarks, _diameter
 from topograph.localize.submap import Submap
 
 
+LOOKS_EVERY = 2.0
+"""Metres after which a further look counts as a new trial for the prior of another orchard."""
+
+
 @dataclass(frozen=True, slots=True)
 class Posterior:
     """Over placements of the submap; probabilities sum to one together with `unknown` and `rest`.
@@ -125,7 +129,9 @@ def weigh(found: Found, marks: Landmarks, submap: Submap, index: MapIndex, confi
     random -= index.density * float(seen.sum())
     # Another orchard of this design: any of its placements would do, so its prior is spread over one cell of the lattice.
     design = float(alike[np.isfinite(alike)].max(initial=-np.inf)) - np.log(np.pi / (2.0 * index.density))
-    unknown = np.logaddexp(np.log(c.unknown) + random, np.log(c.alike) + design)
+    # Looking again and again finds a lucky fit sooner or later: the longer nothing was sure, the more is asked.
+    alike_prior = c.alike * max(1.0, submap.filter.run / LOOKS_EVERY)
+    unknown = np.logaddexp(np.log(c.unknown) + random, np.log(alike_prior) + design)
     rest = (np.log(found.rest) + placed.min()) if found.rest > 0 else -np.inf
     dropped = np.log(max(found.seeds, 1)) - c.bound + placed.max()
     rest = np.logaddexp(rest, dropped)

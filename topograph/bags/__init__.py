@@ -7,5 +7,6 @@ from topograph.bags.config import BagsConfig
 from topograph.bags.messages import Fix, Heading, Imu, Odometry, Trunks
 from topograph.bags.recording import Recording
 from topograph.bags.scan import Scan
+from topograph.bags.scan import decode as decode_scan
 
-__all__ = ["BagsConfig", "Fix", "Heading", "Imu", "Odometry", "Recording", "Scan", "Trunks"]
+__all__ = ["BagsConfig", "Fix", "Heading", "Imu", "Odometry", "Recording", "Scan", "Trunks", "decode_scan"]

@@ -349,17 +349,20 @@ def simulate(
 @click.argument("folder", type=click.Path(path_type=Path), default=Path("demo"))
 @click.option("--seed", type=int, default=7, show_default=True)
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
-def demo(folder: Path, seed: int, quiet: bool) -> None:
-    """Simulate an orchard, map it, and write a page to look at, in FOLDER."""
+@click.pass_context
+def demo(context: click.Context, folder: Path, seed: int, quiet: bool) -> None:
+    """Simulate an orchard, map it, localize a later run in it, and write pages to look at, in FOLDER."""
     import shutil
 
     from topograph import pipeline
+    from topograph.cli.localizing import localize
     from topograph.config import Config
+    from topograph.evaluate import map_metrics
     from topograph.simulate import DriveConfig, SensorConfig, record
 
-    bag = folder / "run1.bag"
+    bag, later = folder / "run1.bag", folder / "run3.bag"
     folder.mkdir(parents=True, exist_ok=True)
-    for old in (bag, folder / "run1.truth"):
+    for old in (bag, folder / "run1.truth", later, folder / "run3.truth"):
         shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
     with progress_bar(quiet) as progress:
         truth = record(
@@ -370,9 +373,16 @@ def demo(folder: Path, seed: int, quiet: bool) -> None:
         run = pipeline.read_run([bag], config, progress)
         solved = pipeline.solve_run(run, config, progress=progress)
         topo = _save_results(solved, config, [bag], folder, folder / "orchard.gpkg", truth, None, progress)
-    from topograph.evaluate import map_metrics
-
+        record(
+            later, seed, "olive", DriveConfig(run=3, longest_s=30.0), SensorConfig(gnss="none"),
+            progress=lambda share: progress("simulate a later run, without GNSS", share),
+        )  # fmt: skip
     table(map_metrics(topo, truth))
+    click.echo("the later run, localized in this map:")
+    context.invoke(
+        localize, map_file=folder / "orchard.gpkg", bags=(later,), results=folder / "localization",
+        truth=folder / "run3.truth", quiet=quiet,
+    )  # fmt: skip
     click.echo(f"look at {folder / 'report.html'} (browser), {folder / 'orchard.gpkg'} (QGIS), {folder / 'map.png'}")
 
 

@@ -29,8 +29,8 @@ from topograph.errors import UsageError
 @main.command()
 @click.argument("map_file", metavar="MAP", type=click.Path(path_type=Path))
 @click.argument("bags", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--method", type=click.Choice(["graph", "thesis"]), default="graph", show_default=True,
-              help="graph: submap, evidence, track; thesis: Algorithms 4-6, to compare with.")  # fmt: skip
+@click.option("--method", type=click.Choice(["graph", "thesis", "both"]), default="graph", show_default=True,
+              help="graph: submap, evidence, track; thesis: Algorithms 4-6, to compare with; both: side by side.")  # fmt: skip
 @click.option(
     "--risk", type=click.FloatRange(1e-9, 0.5), default=None, help="Chance of a wrong pose that is accepted (1e-4)."
 )
@@ -58,14 +58,25 @@ def localize(
     if risk is not None:
         config = replace(config, localize=replace(config.localize, risk=risk))
     true = truth_of(truth)
-    topo = store.load(map_file, clouds=method == "thesis")
+    topo = store.load(map_file, clouds=method != "graph")
     if true is not None and topo.datum is None:
         raise UsageError("--truth needs a georeferenced map: without a datum the two frames have nothing in common")
     folder = results_folder(results)
     with progress_bar(quiet) as progress:
-        run = pipeline.localize_bags(topo, bags, config, method, progress, (from_s, to_s))
+        first = "thesis" if method == "thesis" else "graph"
+        run = pipeline.localize_bags(topo, bags, config, first, progress, (from_s, to_s))
+        other = None
+        if method == "both":
+            other = pipeline.localize_bags(topo, bags, config, "thesis", progress, (from_s, to_s))
     errors = None if true is None or topo.datum is None else localization_errors(run.reports, true, topo.datum)
     metrics = localization_metrics(run.reports, run.distance, run.update_ms, errors)
+    by_method = {} if errors is None else {first: errors}
+    if other is not None:
+        theirs = None if true is None or topo.datum is None else localization_errors(other.reports, true, topo.datum)
+        by_method |= {} if theirs is None else {"thesis": theirs}
+        found = localization_metrics(other.reports, other.distance, other.update_ms, theirs)
+        metrics += [replace(m, name=f"thesis: {m.name}") for m in found]
+        run.exploded = other.exploded
     fixes = run.fixes
     poses = np.array([f.map_T_robot for f in fixes]).reshape(-1, 4, 4)
     write_tum(folder / "localization.tum", np.array([f.stamp_ns for f in fixes], np.int64), poses)
@@ -74,8 +85,9 @@ def localize(
     text = dump(config)
     write_text(folder / "config.yaml", text)
     figures = {"Localization": localization_figure(topo, run.reports)}
-    if errors is not None and len(errors.stamps_ns):
-        figures["Errors"] = localization_error_figure({method: errors})
+    if any(len(e.stamps_ns) for e in by_method.values()):
+        figures["Errors"] = localization_error_figure(by_method)
+        (folder / "errors.png").write_bytes(figures["Errors"])
     (folder / "localization.png").write_bytes(figures["Localization"])
     inputs = [{"path": p.name, "sha256": hash_of(p)} for p in (map_file, *bags)]
     said = verdict(run.reports, run.distance)

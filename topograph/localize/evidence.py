@@ -22,7 +22,6 @@ from topograph.localize.index import MapIndex
 from topograph.localize.search import Found, Landmarks, _diameter
 from topograph.localize.submap import Submap
 
-
 LOOKS_EVERY = 2.0
 """Metres after which a further look counts as a new trial for the prior of another orchard."""
 

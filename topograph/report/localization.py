@@ -86,3 +86,34 @@ def localization_error_figure(errors: Mapping[str, LocalizationErrors]) -> bytes
     axes[2].set_xlabel("t [s]")
     figure.tight_layout()
     return _png(figure)
+
+
+def cost_figure(rows: Sequence[Mapping[str, float | str]]) -> bytes:
+    """Search and update time, and memory, against the number of trees; `rows` as tools/evaluate_localization.py makes them."""
+    figure = Figure(figsize=(9, 3.6))
+    for k, (key, label) in enumerate(
+        (
+            ("search_ms", "full search [ms]"),
+            ("update_ms", "median update [ms]"),
+            ("bytes_per_tree", "index [bytes a tree]"),
+        )
+    ):
+        ax = figure.add_subplot(1, 3, k + 1)
+        for scenario, color in zip(sorted({str(r["scenario"]) for r in rows}), (TREE, BAD, PATH), strict=False):
+            mine = [r for r in rows if r["scenario"] == scenario]
+            ax.plot(
+                [float(r["trees"]) for r in mine],
+                [float(r[key]) for r in mine],
+                "o-",
+                ms=3,
+                color=color,
+                label=scenario,
+            )
+        ax.set_xscale("log")
+        ax.set_yscale("log")
+        ax.set_xlabel("trees")
+        ax.set_title(label, fontsize=9)
+        ax.grid(alpha=0.3, which="both")
+    figure.axes[0].legend(fontsize=8)
+    figure.tight_layout()
+    return _png(figure)

@@ -38,13 +38,22 @@ def exists(
     ratio = found / np.maximum(shown, 1)
     scored = bool(np.any(detections.score != 0.0))  # recorded detections may come without
     # Scores differ between sensors and orchards: what counts is also how this run's own trees score.
-    usual = float(np.median(score[enough])) if enough.any() else 0.0
+    usual = _usual(score[enough], hits[enough])
     ok = (
         enough
         & ((score >= min(config.min_score, config.usual_score * usual)) | (not scored))
         & ((ratio >= config.min_ratio) | (shown < 4))
     )
     return ok, score, hits, shown
+
+
+def _usual(score: Array, hits: NDArray[np.int64]) -> float:
+    """Median score, by sightings: false trees are many, but seldom seen."""
+    if not len(score):
+        return 0.0
+    order = np.argsort(score)
+    total = np.cumsum(hits[order])
+    return float(score[order[np.searchsorted(total, 0.5 * total[-1])]])
 
 
 def _chance(far: Array, bearing: Array, seen: NDArray[np.bool_], hits: NDArray[np.int64]) -> Array:

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from topograph.config import Config
-from topograph.pipeline import read_run, residual_metrics, solve_run, topo_map, why_no_trees
+from topograph.evaluate import read_tum
+from topograph.geometry import align_se3, interpolate, transform
+from topograph.pipeline import localize_bags, read_run, residual_metrics, solve_run, topo_map, why_no_trees
 
 
 def test_husky_without_lidar(shared: Path) -> None:
@@ -31,3 +33,21 @@ def test_victoria_park(shared: Path) -> None:
     d = np.linalg.norm(topo.p[:, None, :2] - topo.p[None, :, :2], axis=2) + 1e9 * np.eye(len(topo))
     assert (d.min(axis=1) < 1.0).mean() <= 0.02
     assert 80 < len(topo) < 250
+
+
+@pytest.mark.slow
+def test_forest_is_found_again(shared: Path) -> None:
+    """Real trees in a forest: mapped in the first 240 s, the rest localized in that map; no pose is far from the reference."""
+    bag = shared / "evo_forest"
+    s = solve_run(read_run([bag], Config(), span_s=(0.0, 240.0)), Config())
+    found = localize_bags(topo_map(s, Config(), {}), [bag], Config(), span_s=(240.0, 480.0))
+    stamps, poses = read_tum(shared / "evo_forest.tum")
+    e = s.estimate
+    reference = interpolate(stamps, poses, e.stamps_ns)[:, :3, 3]
+    frame = align_se3(e.map_T_robot[:, :3, 3], reference)
+    at = np.array([f.stamp_ns for f in found.fixes])
+    p = transform(frame, np.array([f.map_T_robot[:3, 3] for f in found.fixes]))
+    error = np.hypot(*(p - interpolate(stamps, poses, at)[:, :3, 3])[:, :2].T)
+    assert len(at) > 0.9 * len(found.reports)
+    assert error.mean() < 0.1
+    assert error.max() < 0.5

@@ -115,8 +115,8 @@ def show(m: Metric) -> str:
         return f"{100 * v:.1f} cm" if abs(v) < 1 else f"{v:.2f} m"
     if m.unit == "rad":
         return f"{np.degrees(v):.2f}°"
-    if float(v).is_integer() and abs(v) >= 2:
-        return f"{int(v)}"
+    if isinstance(v, int) or (float(v).is_integer() and abs(v) >= 2):
+        return f"{int(v)} {m.unit}".strip()
     return f"{v:.3f} {m.unit}".strip()
 
 

@@ -12,6 +12,10 @@ from scipy.spatial import cKDTree
 from topograph.geometry import Array
 
 
+DIAMETER_NOISE = 0.02
+"""Standard deviation of a mapped diameter, m: orchards whose diameters vary no more than this are all alike."""
+
+
 @dataclass(frozen=True, slots=True)
 class MapIndex:
     """Trees in the plane, and what answers the search's questions in constant time.
@@ -115,7 +119,7 @@ def build_index(
         length[by_length].astype(np.float32), pairs[by_length, 0].astype(np.int32), pairs[by_length, 1].astype(np.int32),
         density, area, jitter,
         float(np.clip(jitter**2 / (map_sigma**2 + float(np.median(var))) - 0.4, 0.0, 1.0)),
-        float(np.mean(diameter[ok])) if ok.any() else np.nan, float(np.std(diameter[ok])) if ok.sum() > 1 else 0.0,
+        float(np.mean(diameter[ok])) if ok.any() else np.nan, _spread(diameter[ok]),
     )  # fmt: skip
 
 
@@ -125,6 +129,13 @@ def _covered_area(xy: Array, gap: float) -> float:
     cells, counts = np.unique(np.floor(xy / side).astype(np.int64), axis=0, return_counts=True)
     inner = counts >= 0.5 * np.median(counts)
     return float(len(cells[inner]) * side * side * len(xy) / max(counts[inner].sum(), 1))
+
+
+def _spread(diameter: Array) -> float:
+    """Standard deviation of the population's diameters, without what the map's own measurements add; 0: all alike."""
+    if len(diameter) < 2:
+        return 0.0
+    return float(np.sqrt(max(float(np.var(diameter)) - DIAMETER_NOISE**2, 0.0)))
 
 
 @njit(cache=True)

@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 
 from topograph.geometry import Array
 
-
 DIAMETER_NOISE = 0.02
 """Standard deviation of a mapped diameter, m: orchards whose diameters vary no more than this are all alike."""
 

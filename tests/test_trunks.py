@@ -202,3 +202,14 @@ def test_the_thesis_front_end_finds_a_bare_trunk() -> None:
             len(ThesisDetector(MOUNT, ThesisTrunksConfig())(replace(noisy, xyz=cloud.astype(np.float32)), np.zeros(6)))
             == 0
         )
+
+
+def test_missing_times_are_said_in_centimetres(lidar_run: tuple[Path, Truth], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A driver that drops the time of each point costs accuracy; the run's notes say how much."""
+    from topograph.bags import recording
+
+    full = recording.decode_scan
+    monkeypatch.setattr(recording, "decode_scan", lambda m, stamp: replace(full(m, stamp), offset=None))
+    run = read_run([lidar_run[0]], Config(), span_s=(0.0, 8.0))
+    assert any("no time per point" in n and " cm off" in n for n in run.notes)
+    assert run.skipped["points: no time per point, not deskewed"] == run.scans

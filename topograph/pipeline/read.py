@@ -125,6 +125,8 @@ def read_run(
                     f"{name} frame {streams.frames[k]!r} is not in TF: taken at the base; "
                     f"add --extrinsic {streams.frames[k]}=X,Y,Z,ROLL,PITCH,YAW"
                 )
+        if recording.skipped[_NO_TIME]:
+            notes.append(_smear(streams, trunks))
         child_T_robot = child_mount(recording, streams.frames.get("child", ""), config, notes)
         skipped = recording.skipped
         chosen, duration = dict(recording.chosen), recording.duration_s
@@ -139,6 +141,23 @@ def read_run(
         len(trunks),
         time.perf_counter() - began,
         duration,
+    )
+
+
+_NO_TIME = "points: no time per point, not deskewed"
+
+
+def _smear(streams: Streams, trunks: Sequence[Trunks]) -> str:
+    """By how many centimetres it matters that points have no time."""
+    period = float(np.median(np.diff([t.stamp_ns for t in trunks]))) * 1e-9 if len(trunks) > 1 else 0.1
+    period = min(period, 0.2)
+    speed, rate = np.zeros(1), np.zeros(1)
+    if len(streams.odometry_ns):
+        speed, rate = np.abs(streams.twist[:, 0]), np.abs(streams.twist[:, 5])
+    moved, turned = (float(np.percentile(v, 90)) * period for v in (speed, rate))
+    return (
+        f"no time per point: sweeps are not deskewed, and trunks may be {100 * moved:.0f} cm off while driving "
+        f"and {100 * 10 * turned:.0f} cm at 10 m in turns (motion within one sweep)"
     )
 
 
@@ -221,6 +240,8 @@ def _detector(recording: Recording, config: Config) -> Callable[[Scan, StreamsBu
         if streams.imu:
             mount = recording.frames.find(streams.imu[0].frame)
             robot_R_imu = None if mount is None else mount[:3, :3]
+        if scan.offset is None:
+            recording.skipped[_NO_TIME] += 1
         first, last = scan.stamp_ns, scan.stamp_ns
         if scan.offset is not None and len(scan.offset):
             first += int(np.nanmin(scan.offset) * 1e9)

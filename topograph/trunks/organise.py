@@ -77,6 +77,8 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
     p = np.empty((m, 3), np.float32)
     r = np.empty(m, np.float32)
     fill = count[:-1].copy()
+    before = np.zeros((n_rings, 2), np.float32)
+    turns = np.zeros((n_rings, 2), np.int64)
     low = np.full((2 * HALF, 2 * HALF), 1e9, np.float32)
     for i in range(n):
         if not inside[i]:
@@ -85,6 +87,11 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
         k = fill[g]
         fill[g] = k + 1
         x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        # Order is judged before the motion is taken out: near leaves and far ground shift differently.
+        side = before[g, 0] * y - before[g, 1] * x
+        turns[g, 0] += side > 0
+        turns[g, 1] += side < 0
+        before[g, 0], before[g, 1] = x, y
         bx = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + tx
         by = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + ty
         bz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + tz
@@ -107,14 +114,7 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
         if hi - lo < 3:
             continue
         # Firing order is azimuth order but for the place where the turn closes; anything else is sorted.
-        up, down = 0, 0
-        for i in range(lo + 1, hi, 3):
-            side = (p[i - 1, 0] - tx) * (p[i, 1] - ty) - (p[i - 1, 1] - ty) * (p[i, 0] - tx)
-            if side < 0:
-                down += 1
-            elif side > 0:
-                up += 1
-        if min(up, down) > 1 + (hi - lo) // 600:
+        if min(turns[k, 0], turns[k, 1]) > 2 + (hi - lo) // 200:
             order = np.argsort(np.arctan2(p[lo:hi, 1] - ty, p[lo:hi, 0] - tx))
             p[lo:hi] = p[lo:hi][order]
             r[lo:hi] = r[lo:hi][order]

@@ -1,6 +1,6 @@
 """Localization by the thousand starts, on simulated trunk detections.
 
-    python tools/evaluate_localization.py starts | risk | mismatch | nowhere | kidnap | track | cost  [--seed N] [--quick]
+    python tools/evaluate_localization.py starts | thesis | risk | mismatch | nowhere | kidnap | track | cost  [--seed N] [--quick]
 
 Seeds below 1,000,000 were looked at while building; the default seeds begin there and are for reporting only.
 """
@@ -18,11 +18,15 @@ from pathlib import Path
 
 import numpy as np
 
+from topograph.bags import Trunks
+from topograph.localize import ThesisConfig, ThesisMethod
 from topograph.localize.config import LocalizeConfig
 from topograph.localize.engine import Belief, Engine
 from topograph.localize.index import MapIndex, build_index
 from topograph.localize.submap import Move, Sweep
+from topograph.motion import Leg
 from topograph.simulate.starts import SCENARIOS, StartsConfig, Step, World, drive, world
+from topograph.topomap import TopoMap
 
 WRONG_M, WRONG_RAD = 0.5, 0.1
 
@@ -149,6 +153,46 @@ def starts(seed: int, quick: float) -> None:
                     )
             best = many(partial(start, c=c, config=told(c, clutter=1e-3), length=length, told_as=replace(c, clutter=1e-3, scale=1e-4, white=1e-4, wander=1e-5), oracle=True), range(seed, seed + max(4, int(n * quick))))  # fmt: skip
             print(line("    oracle", best, length), flush=True)
+
+
+def thesis_start(seed: int, c: StartsConfig, length: float) -> Start:
+    """The thesis's method on the same starts as `start`; it has no view of risk: one pose left is its commit."""
+    rng = np.random.default_rng([seed, 5])
+    w = world(c, rng)
+    n = len(w.mapped)
+    none, up = np.full(n, np.nan), np.tile([0.0, 0.0, 1.0], (n, 1))
+    topo = TopoMap(
+        None, np.arange(n), np.column_stack([w.mapped, np.zeros(n)]), np.tile(1e-4 * np.eye(3), (n, 1, 1)), up, none, none,
+        np.ones(n, np.int64), none, np.full(n, -1), np.zeros((0, 2), np.int64), none[:0], (), np.zeros(0, np.int64),
+        np.zeros((0, 4, 4)), np.eye(3),
+    )  # fmt: skip
+    method = ThesisMethod(topo, ThesisConfig(view=c.view, icp=0.0))
+    metres, ms, trees = 0.0, [], -1
+    for k, s in enumerate(drive(w, c, rng, length)):
+        metres += s.distance
+        trees = int((s.source >= 0).sum()) if trees < 0 else trees
+        m = len(s.p)
+        trunks = Trunks(
+            k + 1, "base_link", np.column_stack([s.p, np.full(m, 0.8)]), np.tile([0.0, 0.0, 1.0], (m, 1)),
+            np.full(m, np.nan), np.tile(0.01 * np.eye(3), (m, 1, 1)), np.full(m, 0.8), np.ones(m),
+        )  # fmt: skip
+        began = time.perf_counter()
+        report = method.step(trunks, Leg(s.motion, 0, 0, 0, s.distance, abs(s.motion[2]), 0.5, True, True, True))
+        ms.append(1e3 * (time.perf_counter() - began))
+        if report.fix is not None:
+            e = float(np.hypot(*(report.fix.map_T_robot[:2, 3] - s.pose[:2])))
+            return Start(metres, e > 1.0, e, ms, trees)
+    return Start(np.inf, False, np.nan, ms, trees)
+
+
+def thesis(seed: int, quick: float) -> None:
+    """The thesis's method (without its ICP step: there are no clouds) on thesis-like orchards."""
+    runs = many(partial(thesis_start, c=SCENARIOS["T"], length=25.0), range(seed, seed + max(4, int(400 * quick))))
+    print(line("thesis-like (T), the thesis's method", runs, 25.0), flush=True)
+    for k in (2, 3, 4, 5):
+        some = [min(r.metres, 25.0) for r in runs if (r.trees == k if k < 5 else r.trees >= k)]
+        if some:
+            print(f"    {k}{'+' if k == 5 else ' '} trees seen at the start: {np.mean(some):.2f} m ({len(some)})")
 
 
 def risk(seed: int, quick: float) -> None:
@@ -354,7 +398,7 @@ def cost(seed: int, quick: float, picture: Path) -> None:
 def main() -> None:
     """Run one of the experiments."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["starts", "risk", "mismatch", "nowhere", "kidnap", "track", "cost"])
+    parser.add_argument("what", choices=["starts", "thesis", "risk", "mismatch", "nowhere", "kidnap", "track", "cost"])
     parser.add_argument("--seed", type=int, default=1_000_000)
     parser.add_argument("--quick", type=float, default=1.0, help="Share of the runs.")
     parser.add_argument("--picture", type=Path, default=Path("cost.png"))

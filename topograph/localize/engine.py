@@ -16,6 +16,8 @@ from topograph.localize.index import MapIndex
 from topograph.localize.search import Found, search
 from topograph.localize.submap import BINS, Move, Submap, Sweep, Visibility, assign, in_view, sectors
 
+OVERRULE = 0.01
+"""Share of the risk at which the shadow may overrule a track: it is asked every metre, and the track was sure as well."""
 NO_PAIRS = np.zeros((0, 2), np.int64)
 STATES = ("searching", "ambiguous", "tracking", "degraded", "lost")
 
@@ -249,7 +251,7 @@ class Engine:
             self._look()
             h.searched = f.run
             p = h.posterior
-            if len(p.pose) and p.risk <= c.risk and self.track is not None:
+            if len(p.pose) and p.risk <= OVERRULE * c.risk and self.track is not None:
                 other = anchored(h, self.index, c)
                 apart = np.hypot(*(other.mean[:2] - self.track.mean[:2]))
                 turn = abs((other.mean[2] - self.track.mean[2] + np.pi) % (2 * np.pi) - np.pi)

@@ -14,7 +14,7 @@ from topograph.localize.evidence import Posterior, describe, nothing, weigh
 from topograph.localize.filter import Filter
 from topograph.localize.index import MapIndex
 from topograph.localize.search import Found, search
-from topograph.localize.submap import BINS, Move, Submap, Sweep, Visibility, assign, in_view, sectors
+from topograph.localize.submap import BINS, Move, Submap, Sweep, Visibility, absorb, assign, in_reach, in_view, sectors
 
 OVERRULE = 0.01
 """Share of the risk at which the shadow may overrule a track: it is asked every metre, and the track was sure as well."""
@@ -151,10 +151,10 @@ class Engine:
         """One scan of tracking; the pairs of trunks and mapped trees."""
         c = self.config
         f.predict(move.step, move.cov, move.distance)
-        near = np.hypot(*sweep.p.T) < c.view if len(sweep) else np.zeros(0, bool)
-        z, R = sweep.p[near], sweep.cov[near] + c.trunk_sigma**2 * np.eye(2)
+        used, rows = in_reach(sweep, c)
+        z = used.p
         self._bring_in(f)
-        m2, logdet = f.innovations(z, R)
+        m2, logdet = f.innovations(z, used.cov)
         match = assign(m2, logdet, c.gate)
         blocked = sectors(z)
         reach, hidden = in_view(f.mean, f.n, blocked)
@@ -163,19 +163,10 @@ class Engine:
         self._suspect(f, z, m2, logdet, match, found, reach, hidden)
         looked = found | (~hidden & (reach < c.view))
         f.looks[looked] += 1
-        d, dv = sweep.diameter[near], sweep.diameter_var[near]
-        lonely = (match < 0) & ((m2 > 2.5 * c.gate).all(axis=1) if f.n else np.ones(len(z), bool))
-        for i in np.flatnonzero(match >= 0):
-            k = int(match[i])
-            f.update(k, z[i], R[i])
-            f.count(k, d[i], dv[i], float(np.hypot(*z[i])))
-        for i in np.flatnonzero(lonely):
-            k = f.add(z[i], R[i])
-            f.looks[k] = 1
-            f.count(k, d[i], dv[i], float(np.hypot(*z[i])))
+        absorb(f, used, m2, match, c.gate)
         mapped = np.flatnonzero(match >= 0)
         mapped = mapped[f.tree[match[mapped]] >= 0]
-        pairs = np.stack([np.flatnonzero(near)[mapped], f.tree[match[mapped]]], axis=1)
+        pairs = np.stack([rows[mapped], f.tree[match[mapped]]], axis=1)
         if len(pairs):
             self._matched_at = f.run
         away = np.hypot(*(f.landmarks - f.mean[:2]).T) > c.view + 8.0

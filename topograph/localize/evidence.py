@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from topograph.geometry import Array
 from topograph.localize.config import LocalizeConfig
 from topograph.localize.index import MapIndex
-from topograph.localize.search import Found, Landmarks, _diameter
+from topograph.localize.search import Found, Landmarks, _diameter, spread
 from topograph.localize.submap import Submap
 
 LOOKS_EVERY = 2.0
@@ -35,7 +35,6 @@ class Posterior:
         p: (M,) probabilities; `unknown`: not on this map; `rest`: placements that were dropped or not evaluated.
         tree: (M, n) mapped tree of each landmark, -1 none.
         scale: (M,) most probable noise scale.
-        cov: (3, 3) of the best placement, about the map's origin of the pose.
         log: (M,) log evidence, to compare with the same submap later.
     """
 
@@ -45,7 +44,6 @@ class Posterior:
     rest: float
     tree: NDArray[np.int64]
     scale: Array
-    cov: Array
     log: Array
 
     @property
@@ -56,15 +54,11 @@ class Posterior:
 
 def nothing() -> Posterior:
     """Before anything is known."""
-    return Posterior(
-        np.zeros((0, 3)), np.zeros(0), 1.0, 0.0, np.zeros((0, 0), np.int64), np.zeros(0), np.eye(3), np.zeros(0)
-    )
+    return Posterior(np.zeros((0, 3)), np.zeros(0), 1.0, 0.0, np.zeros((0, 0), np.int64), np.zeros(0), np.zeros(0))
 
 
 def describe(submap: Submap, index: MapIndex, config: LocalizeConfig) -> tuple[Landmarks, NDArray[np.int64]]:
     """The landmarks to search with, and their rows in the submap's filter."""
-    from topograph.localize.search import spread
-
     f, c, v = submap.filter, config, submap.visibility
     rows = np.arange(f.n)
     if f.n > c.landmarks:
@@ -109,15 +103,13 @@ def weigh(found: Found, marks: Landmarks, submap: Submap, index: MapIndex, confi
         index.diameter, index.diameter_mean, index.diameter_sd, index.origin, index.cell, index.nearest, index.bucket,
         index.buckets, index.start, index.member, submap.raster, submap.origin, c.felled, c.map_sigma**2,
     )  # fmt: skip
-    log, pose, tree, scale, cov, alike = _evidence(
-        found.pose, *arguments, index.density, index.trust, 2.0 * index.jitter**2, scales, prior, c.bound, found.loss
-    )
+    log, pose, tree, scale, alike = _evidence(found.pose, *arguments, index.trust, 2.0 * index.jitter**2, scales, prior)
     order = np.argsort(-log)
     order = order[np.isfinite(log[order])]
     order = order[_unlike(pose[order], marks.m.mean(0))]
     if not len(order):
         return nothing()
-    log, pose, tree, scale, cov = log[order], pose[order], tree[order], scale[order], cov[order]
+    log, pose, tree, scale = log[order], pose[order], tree[order], scale[order]
     flat = np.log(1.0 - c.unknown - c.alike) - np.log(index.area * 2 * np.pi)
     placed = log + flat
     # Trees at random, with the density of the map where the submap looked.
@@ -142,7 +134,6 @@ def weigh(found: Found, marks: Landmarks, submap: Submap, index: MapIndex, confi
         float(np.exp(rest - total)),
         tree,
         scale,
-        cov[0],
         placed,
     )
 
@@ -220,7 +211,7 @@ def _match(
 @njit(cache=True)
 def _evidence(
     poses, m, P, tree, other, dia, dia_var, var, xy, tvar, tdia, dmean, dsd, origin, cell, nearest, bucket, buckets, start,
-    member, raster, so, felled, base, density, trust, wild, scales, prior, bound, loss,
+    member, raster, so, felled, base, trust, wild, scales, prior,
 ):  # fmt: skip
     n, M = len(m), len(poses)
     log = np.full(M, -np.inf)
@@ -228,7 +219,6 @@ def _evidence(
     out = poses.copy()
     trees = np.full((M, n), -1, np.int64)
     scale = np.ones(M)
-    covs = np.zeros((M, 3, 3))
     seen = _chance(raster, felled)
     centre = np.array([so[0] + 0.5 * raster.shape[0], so[1] + 0.5 * raster.shape[1]])
     reach = 0.5 * np.sqrt(float(raster.shape[0] ** 2 + raster.shape[1] ** 2))
@@ -297,7 +287,6 @@ def _evidence(
         log[h] = fixed + top + np.log(total)
         out[h, 0], out[h, 1], out[h, 2] = x, y, yaw
         trees[h] = ids
-        covs[h] = np.linalg.inv(L)
         if log[h] > best:
             best = log[h]
         if log[h] > best - 6.0:
@@ -308,7 +297,7 @@ def _evidence(
                     fixed - 0.5 * trust * qa - 0.5 * la - 0.5 * np.linalg.slogdet(La)[1] + (1.5 - k) * np.log(2 * np.pi)
                 )
                 alike[h] = np.logaddexp(alike[h], anew - np.log(len(scales)))
-    return log, out, trees, scale, covs, alike
+    return log, out, trees, scale, alike
 
 
 @njit(cache=True)

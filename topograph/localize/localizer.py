@@ -82,7 +82,6 @@ class GraphMethod:
         self.engine: Engine | None = None
         self._tilt = np.zeros(3)  # z of the base in the map (m), and roll and pitch (rad) beyond what gravity says
         self._tilt_cov = np.diag([100.0, 0.0, 0.0])
-        self._up = 0.0
         self._vertical = np.array([0.0, 0.0, 1.0])
         self._row = _row_direction(topo)
 

@@ -93,25 +93,16 @@ class Submap:
         """One scan further."""
         f, c = self.filter, self.config
         f.predict(move.step, move.cov, move.distance)
-        near = np.hypot(*sweep.p.T) < c.view if len(sweep) else np.zeros(0, bool)
-        z, R = sweep.p[near], sweep.cov[near] + c.trunk_sigma**2 * np.eye(2)
-        d, dv = sweep.diameter[near], sweep.diameter_var[near]
+        used, _ = in_reach(sweep, c)
+        z = used.p
         v = self.visibility
         v.scans += 1
         v.found += (len(z) - v.found) / min(v.scans, 50)
-        m2, logdet = f.innovations(z, R)
+        m2, logdet = f.innovations(z, used.cov)
         match = assign(m2, logdet, c.gate)
         blocked = sectors(z)
         self._count_looks(match, blocked)
-        lonely = (match < 0) & ((m2 > 2.5 * c.gate).all(axis=1) if f.n else np.ones(len(z), bool))
-        for i in np.flatnonzero(match >= 0):
-            k = int(match[i])
-            f.update(k, z[i], R[i])
-            f.count(k, d[i], dv[i], float(np.hypot(*z[i])))
-        for i in np.flatnonzero(lonely):
-            k = f.add(z[i], R[i])
-            f.looks[k] = 1
-            f.count(k, d[i], dv[i], float(np.hypot(*z[i])))
+        absorb(f, used, m2, match, c.gate)
         self.scans += 1
         self._drop()
         self._look(blocked)
@@ -158,6 +149,26 @@ class Submap:
             self.raster = np.pad(self.raster, more)
             self.origin = self.origin - more
         _enter(self.raster, self.origin, x, y, yaw, blocked, np.append(BINS, 1e9), self.visibility.table(), reach)
+
+
+def in_reach(sweep: Sweep, config: LocalizeConfig) -> tuple[Sweep, NDArray[np.int64]]:
+    """The trunks that are near enough to use, with the deviation that the view of a trunk adds, and their rows."""
+    rows = np.flatnonzero(np.hypot(*sweep.p.T) < config.view) if len(sweep) else np.zeros(0, np.int64)
+    cov = sweep.cov[rows] + config.trunk_sigma**2 * np.eye(2)
+    return Sweep(sweep.p[rows], cov, sweep.diameter[rows], sweep.diameter_var[rows]), rows
+
+
+def absorb(f: Filter, seen: Sweep, m2: Array, match: NDArray[np.int64], gate: float) -> None:
+    """Update the landmarks that are sighted, and begin new ones where no landmark is anywhere near."""
+    lonely = (match < 0) & ((m2 > 2.5 * gate).all(axis=1) if m2.shape[1] else np.ones(len(seen), bool))
+    for i in np.flatnonzero(match >= 0):
+        k = int(match[i])
+        f.update(k, seen.p[i], seen.cov[i])
+        f.count(k, seen.diameter[i], seen.diameter_var[i], float(np.hypot(*seen.p[i])))
+    for i in np.flatnonzero(lonely):
+        k = f.add(seen.p[i], seen.cov[i])
+        f.looks[k] = 1
+        f.count(k, seen.diameter[i], seen.diameter_var[i], float(np.hypot(*seen.p[i])))
 
 
 @njit(cache=True)

@@ -33,8 +33,22 @@ def problem(
     step = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
     motion = Motion(stamps, poses, step, np.zeros(n), False, True)
     nothing = np.zeros(len(k))
-    axis = np.tile([0.0, 0.0, 1.0], (len(k), 1))
-    detections = Detections(stamps, k, p, cov, axis, nothing, nothing + 0.2, nothing)
+    detections = Detections(
+        stamps_ns=stamps,
+        scan=k,
+        p=p,
+        cov=cov,
+        axis=np.tile([0.0, 0.0, 1.0], (len(k), 1)),
+        height=nothing,
+        diameter=nothing + 0.2,
+        score=nothing,
+        kinds=np.full((len(k), 3), np.nan),
+        measured=np.zeros((len(k), 6)),
+        stems=np.ones(len(k), np.int64),
+        source=np.arange(len(k)),
+        free=np.zeros((0, 360), np.uint32),
+        eye=np.zeros((n, 3)),
+    )
     sightings = Sightings(k, j, p, cov, np.ones(len(k), np.int64))
     return Problem(
         stamps, poses, motion.sigma(MotionConfig(), stamps), motion, MotionConfig(), None, NO_FIXES, NO_HEADINGS, None,

@@ -279,16 +279,6 @@ def test_multilateration_of_exact_ranges(seed: int) -> None:
     assert abs((found[2] - yaw + np.pi) % (2 * np.pi) - np.pi) < 1e-3
 
 
-def plain_map(xy: Array) -> TopoMap:
-    n = len(xy)
-    return TopoMap(
-        None, np.arange(1, n + 1), np.column_stack([xy, np.zeros(n)]), np.tile(1e-4 * np.eye(3), (n, 1, 1)),
-        np.tile([0.0, 0.0, 1.0], (n, 1)), np.full(n, np.nan), np.full(n, np.nan), np.full(n, 9), np.zeros(n),
-        np.full(n, -1), np.zeros((0, 2), np.int64), np.zeros(0), (), np.zeros(0, np.int64), np.zeros((0, 4, 4)),
-        np.zeros((3, 3)),
-    )  # fmt: skip
-
-
 def trunks_at(p: Array, stamp: int) -> Trunks:
     n = len(p)
     return Trunks(
@@ -303,13 +293,13 @@ def test_the_thesis_finds_scattered_trees_and_explodes_in_rows() -> None:
     place = np.array([15.0, 14.0])
     seen = trees - place
     leg = Leg(np.zeros(3), 0.0, 0.0, 0.0, 0.0, 0.0, 0.1, True, True, True)
-    method = ThesisMethod(plain_map(trees), ThesisConfig(view=9.0))
+    method = ThesisMethod(TopoMap.of_points(trees), ThesisConfig(view=9.0))
     for k in range(12):
         report = method.step(trunks_at(seen[np.hypot(*seen.T) < 9.0], k + 1), leg)
     assert report.fix is not None
     np.testing.assert_allclose(report.fix.map_T_robot[:2, 3], place, atol=0.05)
     rows = np.stack(np.meshgrid(np.arange(30) * 4.0, np.arange(30) * 4.0), axis=-1).reshape(-1, 2)
-    method = ThesisMethod(plain_map(rows), ThesisConfig(view=9.0))
+    method = ThesisMethod(TopoMap.of_points(rows), ThesisConfig(view=9.0))
     seen = rows - [58.3, 57.9]
     method.step(trunks_at(seen[np.hypot(*seen.T) < 9.0], 1), leg)
     assert method.exploded == 1
@@ -320,14 +310,14 @@ def test_the_thesis_finds_scattered_trees_and_explodes_in_rows() -> None:
 
 def test_a_map_of_one_tree_is_refused() -> None:
     with pytest.raises(InsufficientDataError, match="1 trees"):
-        Localizer(plain_map(np.zeros((1, 2))))
+        Localizer(TopoMap.of_points(np.zeros((1, 2))))
 
 
 def test_live_door_gives_poses_and_reports() -> None:
     """Fed message by message: no pose while nothing is seen, then the right one, then every scan."""
     rng = np.random.default_rng(3)
     trees = rng.uniform(0, 40, (30, 2))
-    localizer = Localizer(plain_map(trees))
+    localizer = Localizer(TopoMap.of_points(trees))
     assert localizer.update(trunks_at(np.zeros((0, 2)), 10**18)) is None
     place = np.array([15.0, 20.0])
     for k in range(8):

@@ -37,10 +37,27 @@ def make(n: int, seed: int = 0, datum: Datum | None = HERE) -> TopoMap:
     diameter = rng.uniform(0.1, 0.5, n)
     branch = np.where(rng.random(n) < 0.5, np.nan, 1.2)
     return TopoMap(
-        datum, np.arange(1, n + 1), p, cov, axis, diameter, branch, rng.integers(1, 99, n), rng.normal(size=n),
-        rng.integers(-1, 3, n), edges, np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1), views,
-        np.arange(5) + 10**18, poses, 1e-4 * np.eye(3), {"config": "a: 1"},
-    )  # fmt: skip
+        datum=datum,
+        ids=np.arange(1, n + 1),
+        p=p,
+        cov=cov,
+        axis=axis,
+        diameter=diameter,
+        first_branch=branch,
+        sightings=rng.integers(1, 99, n),
+        score=rng.normal(size=n),
+        row=rng.integers(-1, 3, n),
+        kind=rng.integers(0, 3, n),
+        kind_probability=np.where(rng.random(n) < 0.5, np.nan, 0.75),
+        stems=rng.integers(1, 4, n),
+        edges=edges,
+        lengths=np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1),
+        viewpoints=views,
+        stamps_ns=np.arange(5) + 10**18,
+        map_T_robot=poses,
+        datum_cov=1e-4 * np.eye(3),
+        meta={"config": "a: 1"},
+    )
 
 
 @settings(max_examples=15, deadline=None)
@@ -58,6 +75,9 @@ def test_round_trip(tmp_path_factory: pytest.TempPathFactory, n: int, seed: int,
         "axis",
         "diameter",
         "first_branch",
+        "kind",
+        "kind_probability",
+        "stems",
         "sightings",
         "score",
         "row",
@@ -169,3 +189,33 @@ def test_radius_rule() -> None:
     xy = np.array([[0.0, 0.0], [3.0, 0.0], [10.0, 0.0]])
     config = replace(TopomapConfig(), edges="radius", radius=5.0)
     np.testing.assert_array_equal(neighbours(xy, config), [[0, 1]])
+
+
+def test_an_older_map_is_read_as_a_map_of_trees(tmp_path: Path) -> None:
+    """Schema 1 knew no kinds: all its landmarks were meant as trees of one stem."""
+    path = tmp_path / "old.gpkg"
+    m = make(7)
+    store.save(m, path)
+    with sqlite3.connect(path) as c:
+        for column in ("kind", "kind_probability", "stems"):
+            c.execute(f"ALTER TABLE trees DROP COLUMN {column}")
+        c.execute("UPDATE meta SET value='1' WHERE key='schema_version'")
+    got = store.load(path)
+    assert got.is_tree.all()
+    assert np.isnan(got.kind_probability).all()
+    np.testing.assert_array_equal(got.stems, 1)
+    np.testing.assert_array_equal(got.p, m.p)
+
+
+def test_trees_alone_keep_their_edges_and_clouds() -> None:
+    """What is no tree leaves the map with its clouds; all else stays where it was."""
+    m = make(12)
+    edges = np.array([e for e in m.edges.tolist() if m.kind[e].max() == 0], np.int64).reshape(-1, 2)
+    m = replace(m, edges=edges, lengths=np.linalg.norm(m.p[edges[:, 0]] - m.p[edges[:, 1]], axis=1))
+    t = m.trees()
+    assert 0 < len(t) < len(m)
+    np.testing.assert_array_equal(t.ids, m.ids[m.kind == 0])
+    np.testing.assert_allclose(np.linalg.norm(t.p[t.edges[:, 0]] - t.p[t.edges[:, 1]], axis=1), t.lengths)
+    for v in t.viewpoints:
+        (twin,) = (w for w in m.viewpoints if m.ids[w.tree] == t.ids[v.tree])
+        np.testing.assert_array_equal(v.cloud, twin.cloud)

@@ -159,13 +159,7 @@ def thesis_start(seed: int, c: StartsConfig, length: float) -> Start:
     """The thesis's method on the same starts as `start`; it has no view of risk: one pose left is its commit."""
     rng = np.random.default_rng([seed, 5])
     w = world(c, rng)
-    n = len(w.mapped)
-    none, up = np.full(n, np.nan), np.tile([0.0, 0.0, 1.0], (n, 1))
-    topo = TopoMap(
-        None, np.arange(n), np.column_stack([w.mapped, np.zeros(n)]), np.tile(1e-4 * np.eye(3), (n, 1, 1)), up, none, none,
-        np.ones(n, np.int64), none, np.full(n, -1), np.zeros((0, 2), np.int64), none[:0], (), np.zeros(0, np.int64),
-        np.zeros((0, 4, 4)), np.eye(3),
-    )  # fmt: skip
+    topo = TopoMap.of_points(w.mapped)
     method = ThesisMethod(topo, ThesisConfig(view=c.view, icp=0.0))
     metres, ms, trees = 0.0, [], -1
     for k, s in enumerate(drive(w, c, rng, length)):

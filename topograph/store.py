@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from topograph.errors import MapError
 from topograph.geometry import Array, Datum, from_quaternion, to_quaternion
-from topograph.topomap import TopoMap, Viewpoint
+from topograph.topomap import KINDS, TopoMap, Viewpoint
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 _WGS84 = (
     'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563,AUTHORITY["EPSG","7030"]],'
     'AUTHORITY["EPSG","6326"]],PRIMEM["Greenwich",0,AUTHORITY["EPSG","8901"]],'
@@ -35,7 +35,7 @@ CREATE TABLE gpkg_geometry_columns (table_name TEXT NOT NULL, column_name TEXT N
   CONSTRAINT pk_geom_cols PRIMARY KEY (table_name, column_name));
 CREATE TABLE trees (id INTEGER PRIMARY KEY NOT NULL, geom BLOB, x REAL, y REAL, z REAL, cov_xx REAL, cov_xy REAL,
   cov_yy REAL, cov_zz REAL, axis_x REAL, axis_y REAL, axis_z REAL, diameter REAL, first_branch REAL,
-  sightings INTEGER, score REAL, "row" INTEGER);
+  sightings INTEGER, score REAL, "row" INTEGER, kind TEXT NOT NULL, kind_probability REAL, stems INTEGER NOT NULL);
 CREATE TABLE edges (id INTEGER PRIMARY KEY NOT NULL, a INTEGER NOT NULL, b INTEGER NOT NULL, length REAL, geom BLOB);
 CREATE TABLE path (id INTEGER PRIMARY KEY NOT NULL, stamp_ns INTEGER NOT NULL, x REAL, y REAL, z REAL,
   qx REAL, qy REAL, qz REAL, qw REAL, geom BLOB);
@@ -102,12 +102,13 @@ def _fill(c: sqlite3.Connection, t: TopoMap) -> None:
             (name, "attributes", name),
         )
     c.executemany(
-        "INSERT INTO trees VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?,?)",
+        f"INSERT INTO trees VALUES ({','.join(20 * '?')})",
         [
             (
                 int(t.ids[i]), _geometry(world[i : i + 1], srs), *_real(t.p[i]),
                 *_real([t.cov[i, 0, 0], t.cov[i, 0, 1], t.cov[i, 1, 1], t.cov[i, 2, 2]]), *_real(t.axis[i]),
                 *_real([t.diameter[i], t.first_branch[i]]), int(t.sightings[i]), *_real([t.score[i]]), int(t.row[i]),
+                KINDS[int(t.kind[i])], *_real([t.kind_probability[i]]), int(t.stems[i]),
             )
             for i in range(len(t))
         ],
@@ -193,11 +194,14 @@ def load(path: Path, *, clouds: bool = True) -> TopoMap:
     """
     with _opened(path) as c:
         meta = dict(c.execute("SELECT key, value FROM meta"))
+        newer = ", kind, kind_probability, stems" if int(meta["schema_version"]) >= 2 else ", 'tree', NULL, 1"
         rows = c.execute(
             "SELECT id, x, y, z, cov_xx, cov_xy, cov_yy, cov_zz, axis_x, axis_y, axis_z, diameter, first_branch, "
-            'sightings, score, "row" FROM trees ORDER BY id'
+            'sightings, score, "row"' + newer + " FROM trees ORDER BY id"
         ).fetchall()
-        v = np.array([[np.nan if x is None else x for x in r] for r in rows], float).reshape(-1, 16)
+        v = np.array([[np.nan if x is None else x for x in r[:16]] for r in rows], float).reshape(-1, 16)
+        kind = np.array([KINDS.index(r[16]) for r in rows], np.int64)
+        chance = np.array([np.nan if r[17] is None else r[17] for r in rows], float)
         ids = v[:, 0].astype(np.int64)
         cov = np.zeros((len(v), 3, 3))
         cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 0] = v[:, 4], v[:, 5], v[:, 5]
@@ -213,12 +217,27 @@ def load(path: Path, *, clouds: bool = True) -> TopoMap:
     edges = edges.reshape(-1, 2)
     p = v[:, 1:4]
     return TopoMap(
-        datum, ids, p, cov, v[:, 8:11], v[:, 11], v[:, 12], v[:, 13].astype(np.int64), v[:, 14],
-        v[:, 15].astype(np.int64), edges, np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1), views, stamps,
-        from_quaternion(path_rows[:, :3], path_rows[:, 3:]) if len(stamps) else np.zeros((0, 4, 4)),
-        np.array([float(x) for x in meta.get("datum_cov", "0 " * 9).split()]).reshape(3, 3),
-        {k: x for k, x in meta.items() if k not in ("schema_version", "datum", "georeferenced", "datum_cov")},
-    )  # fmt: skip
+        datum=datum,
+        ids=ids,
+        p=p,
+        cov=cov,
+        axis=v[:, 8:11],
+        diameter=v[:, 11],
+        first_branch=v[:, 12],
+        sightings=v[:, 13].astype(np.int64),
+        score=v[:, 14],
+        row=v[:, 15].astype(np.int64),
+        kind=kind,
+        kind_probability=chance,
+        stems=np.array([r[18] for r in rows], np.int64),
+        edges=edges,
+        lengths=np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1),
+        viewpoints=views,
+        stamps_ns=stamps,
+        map_T_robot=from_quaternion(path_rows[:, :3], path_rows[:, 3:]) if len(stamps) else np.zeros((0, 4, 4)),
+        datum_cov=np.array([float(x) for x in meta.get("datum_cov", "0 " * 9).split()]).reshape(3, 3),
+        meta={k: x for k, x in meta.items() if k not in ("schema_version", "datum", "georeferenced", "datum_cov")},
+    )
 
 
 _VIEWS = "SELECT tree, vx, vy, vz, points, cloud, crc FROM viewpoints"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +72,11 @@ class Trunks:
         score: (N,) log-odds that it is a tree.
         clouds: N arrays (M, 3) of the trunk's points, or empty.
         surface: `p` is the centroid of the visible surface, not yet on the axis.
+        kinds: (N, 3) log-probabilities of tree, post, other; or (0, 3).
+        measured: (N, 6) what was measured, without a prior: height of `p` above the mean return (m), slope of the axis
+            (x and y per z) and its information, width (m) and its sigma; or (0, 6).
+        stems: (N,) stems joined into one trunk; or (0,).
+        free: (360,) words of what the scan saw through (trunks/passage.py), about `eye` (3,) in `frame`; or (0,).
     """
 
     stamp_ns: int
@@ -84,6 +89,27 @@ class Trunks:
     score: Array
     clouds: tuple[NDArray[np.float32], ...] = ()
     surface: bool = False
+    kinds: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    measured: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    stems: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    free: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(0, np.uint32))
+    eye: Array = field(default_factory=lambda: np.zeros(3))
 
     def __len__(self) -> int:
         return len(self.p)
+
+    @property
+    def likely(self) -> NDArray[np.bool_]:
+        """(N,) rows that are rather a tree or a post than anything else; all, where the source tells no kinds."""
+        if len(self.kinds) != len(self.p):
+            return np.ones(len(self.p), bool)
+        return np.asarray(np.logaddexp(self.kinds[:, 0], self.kinds[:, 1]) > self.kinds[:, 2])
+
+    def select(self, keep: NDArray[np.bool_]) -> Trunks:
+        """The rows where `keep` (N,); what holds for the whole scan stays."""
+        rows = {
+            k: getattr(self, k)
+            for k in ("p", "axis", "diameter", "cov", "height", "score", "kinds", "measured", "stems")
+        }
+        clouds = tuple(c for c, k in zip(self.clouds, keep, strict=True) if k) if self.clouds else ()
+        return replace(self, clouds=clouds, **{k: v[keep] if len(v) == len(keep) else v for k, v in rows.items()})

@@ -73,7 +73,9 @@ def map_command(
         click.echo(f"topograph: {no_trees}; the path is in {folder / 'path.tum'}", err=True)
         raise SystemExit(4)
     where = "georeferenced" if topo.datum is not None else "not georeferenced"
-    click.echo(f"{target}: {len(topo)} trees, {len(topo.edges)} edges, {where}; report: {folder / 'report.html'}")
+    trees, others = int(topo.is_tree.sum()), int((~topo.is_tree).sum())
+    posts = f"{others} posts, " if others else ""
+    click.echo(f"{target}: {trees} trees, {posts}{len(topo.edges)} edges, {where}; report: {folder / 'report.html'}")
 
 
 def _save_results(
@@ -252,7 +254,8 @@ def detect(
         run = pipeline.read_run(bags, config, progress, jobs=jobs)
     if run.scans == 0:
         raise InputError("no point cloud and no trunk detections; name a topic with --topic-points or --topic-trunks")
-    trunks = sorted(run.trunks, key=lambda t: t.stamp_ns)
+    # What a single scan doubts is for the map to decide; here it would only be a false trunk.
+    trunks = [t.select(t.score >= 0) for t in sorted(run.trunks, key=lambda t: t.stamp_ns)]
     n = sum(map(len, trunks))
     click.echo(
         f"{run.scans} scans, {n} trunks ({n / run.scans:.1f} a scan), {run.seconds:.1f} s, {run.duration_s / run.seconds:.1f} × real time"
@@ -311,7 +314,12 @@ def detect(
 
 @main.command()
 @click.argument("output", type=click.Path(path_type=Path))
-@click.option("--design", default="grid", show_default=True, help="grid, olive, steep, gentle or hedgerow.")
+@click.option(
+    "--design",
+    default="grid",
+    show_default=True,
+    help="grid, olive, steep, gentle, hedgerow, young, trellis, old_olive, bare, forest or yard.",
+)
 @click.option("--seed", type=int, default=1, show_default=True)
 @click.option("--run", "number", type=click.IntRange(1, 3), default=1, show_default=True,
               help="1: rows downhill and back; 2: the other way; 3: zigzag (thesis 5.3).")  # fmt: skip
@@ -407,9 +415,9 @@ def view(map_file: Path, output: Path) -> None:
     from topograph.evaluate.metrics import Metric, doubles
 
     topo = store.load(map_file, clouds=False)
-    metrics = [Metric("trees", len(topo)), Metric("edges", len(topo.edges)), doubles(topo)]
+    metrics = [Metric("trees", int(topo.is_tree.sum())), Metric("edges", len(topo.edges)), doubles(topo)]
     notes = [] if topo.datum is not None else ["not georeferenced: the frame is the first pose of the run"]
-    report.write_page(output, map_file.name, topo, metrics, {}, {}, notes, {"schema": "1"})
+    report.write_page(output, map_file.name, topo, metrics, {}, {}, notes, {"schema": "2"})
     click.echo(f"written: {output}")
 
 

@@ -45,10 +45,11 @@ def visible(truth: Truth, least: int = 8) -> NDArray[np.bool_]:
 
 
 def tree_errors(topo: TopoMap, truth: Truth) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Matched rows of the map and of the truth, and errors (M, 3) in the map frame, m.
+    """Matched rows of the map's trees and of the truth, and errors (M, 3) in the map frame, m.
 
     A georeferenced map is compared through WGS84. A local one is first laid onto the truth by its path.
     """
+    topo = topo.trees()
     true = _in_map(topo, truth, truth.trees)
     i, j = match(topo.p[:, :2], true[:, :2])
     return i, j, topo.p[i] - true[j]
@@ -63,6 +64,7 @@ def _in_map(topo: TopoMap, truth: Truth, world_p: Array) -> Array:
 
 def map_metrics(topo: TopoMap, truth: Truth) -> list[Metric]:
     """Precision, recall, errors, doubles, diameters, consistency of the covariances."""
+    topo = topo.trees()
     i, j, e = tree_errors(topo, truth)
     error = np.linalg.norm(e[:, :2], axis=1)
     seen = visible(truth)
@@ -91,6 +93,7 @@ def map_metrics(topo: TopoMap, truth: Truth) -> list[Metric]:
 
 def doubles(topo: TopoMap, nearer: float = 1.0) -> Metric:
     """Share of trees that have another one nearer than `nearer` m."""
+    topo = topo.trees()
     if len(topo) < 2:
         return Metric("doubles", 0.0, "", "lower")
     distance, _ = cKDTree(topo.p[:, :2]).query(topo.p[:, :2], k=2)  # the first is the tree itself

@@ -16,10 +16,10 @@ from topograph.localize.engine import Belief, Engine
 from topograph.localize.index import build_index
 from topograph.localize.method import Fix, Method, Report
 from topograph.localize.submap import Move, Sweep
-from topograph.motion import Leg, Reckoner, twist_during
+from topograph.motion import Leg, Reckoner, twist_during, up_at
 from topograph.topomap import TopoMap
 
-Detect = Callable[[Scan, Array], Trunks]
+Detect = Callable[[Scan, Array, Array | None], Trunks]
 
 
 class Localizer:
@@ -28,7 +28,7 @@ class Localizer:
     Args:
         topo: the map.
         config: settings; `config.risk` is the chance of a wrong pose that is accepted.
-        detect: scan and twist (6,) -> trunks in `base_link`; needed only when scans are fed.
+        detect: scan, twist (6,) and vertical (2,) or None -> trunks in `base_link`; needed only when scans are fed.
         child_T_robot: (4, 4), from odometry's child frame to `base_link`.
         robot_R_imu: (3, 3), the IMU's mounting; None: from gravity.
         method: another method than the default (`thesis.ThesisMethod`).
@@ -67,7 +67,8 @@ class Localizer:
                 0 if scan.offset is None or not len(scan.offset) else int(np.nanmax(scan.offset) * 1e9)
             )
             twist, _ = twist_during(scan.stamp_ns, last, self._recent_odometry, self._recent_imu, self._robot_R_imu)
-            scan = self._detect(scan, twist)
+            up = up_at(scan.stamp_ns, self._recent_odometry, self._recent_imu, self._robot_R_imu)
+            scan = self._detect(scan, twist, up)
         del self._recent_odometry[:-200], self._recent_imu[:-500]
         self.leg = self.reckoner.advance(scan.stamp_ns)
         self.report = self.method.step(scan, self.leg)
@@ -210,5 +211,5 @@ def sweep_of(trunks: Trunks, level_T_robot: Array, leg: Leg, config: LocalizeCon
     if not leg.level:
         least = least + (reach * config.planar_tilt**2) ** 2
     flat[:, [0, 1], [0, 1]] = np.maximum(flat[:, [0, 1], [0, 1]], least[:, None])
-    ok = np.isfinite(p).all(axis=1) & (reach > 0.3)
+    ok = np.isfinite(p).all(axis=1) & (reach > 0.3) & trunks.likely
     return Sweep(p[ok, :2], flat[ok], trunks.diameter[ok], np.full(int(ok.sum()), 0.04**2)), np.flatnonzero(ok)

@@ -56,7 +56,7 @@ class ThesisMethod:
     """
 
     def __init__(self, topo: TopoMap, config: ThesisConfig | None = None) -> None:
-        self.topo = topo
+        self.topo = topo = topo.trees()  # the thesis knows no other landmarks
         self.config = config or ThesisConfig()
         self.nodes = topo.p[:, :2] + topo.axis[:, :2] * (0.8 / np.maximum(topo.axis[:, 2:], 0.3))
         pairs = cKDTree(self.nodes).query_pairs(2 * self.config.view, output_type="ndarray")
@@ -74,7 +74,8 @@ class ThesisMethod:
         """One scan further."""
         flat = transform(from_xyz_rpy(0, 0, 0, leg.roll, leg.pitch, 0), trunks.p) if len(trunks) else np.zeros((0, 3))
         reach = np.hypot(flat[:, 0], flat[:, 1])
-        use = [int(i) for i in np.argsort(reach) if 0.3 < reach[i] < self.config.view][: self.config.trunks]
+        use = [int(i) for i in np.argsort(reach) if 0.3 < reach[i] < self.config.view and trunks.score[i] >= 0]
+        use = use[: self.config.trunks]
         measured = np.zeros((0, 3))
         if len(use) > 1:
             clouds = [trunks.clouds[i] if trunks.clouds else None for i in use]

@@ -1,5 +1,6 @@
 """Odometry + Imu -> Motion: where dead reckoning says the robot is, at any stamp. No map, no trunks."""
 
+from topograph.motion.gravity import up_at
 from topograph.motion.inertial import Inertial, align_imu
 from topograph.motion.online import Leg, Reckoner
 from topograph.motion.reckon import Motion, MotionConfig, dead_reckon
@@ -17,4 +18,5 @@ __all__ = [
     "align_imu",
     "dead_reckon",
     "twist_during",
+    "up_at",
 ]

@@ -22,8 +22,8 @@ def twist_during(
     margin = 50_000_000
     low, high = start_ns - margin, end_ns + margin
     twist = np.zeros(6)
-    wheels = [o.twist for o in _tail(odometry, low) if low <= o.stamp_ns <= high]
-    rates = [i.gyro for i in _tail(imu, low) if low <= i.stamp_ns <= high] if robot_R_imu is not None else []
+    wheels = [o.twist for o in newest(odometry, low) if low <= o.stamp_ns <= high]
+    rates = [i.gyro for i in newest(imu, low) if low <= i.stamp_ns <= high] if robot_R_imu is not None else []
     source = []
     if wheels:
         twist[:] = np.mean(wheels, axis=0)
@@ -37,8 +37,8 @@ def twist_during(
 _P = TypeVar("_P", Odometry, Imu)
 
 
-def _tail(messages: Sequence[_P], low: int) -> list[_P]:
-    """The last messages, back to the first that is older than `low` by a second."""
+def newest(messages: Sequence[_P], low: int) -> list[_P]:
+    """The last messages in time order backwards, back to the first that is older than `low` by a second."""
     out: list[_P] = []
     for m in reversed(messages):
         if m.stamp_ns < low - 1_000_000_000:

@@ -19,14 +19,19 @@ from topograph.pipeline.read import Progress, Run, silent
 from topograph.topomap import TopoMap, build, merge
 from topograph.trees import (
     Detections,
+    Existence,
     LoopCloser,
     TrackTable,
     choose_keyframes,
     exists,
     follow,
     gather,
+    in_order,
     moved_pose,
     refine,
+    relevelled,
+    screen,
+    shapes,
     tabulate,
 )
 
@@ -37,7 +42,7 @@ class Solved:
 
     Attributes:
         tree: (N,) tree of each detection (-1: none), numbered as in the estimate.
-        score, sightings: (T,) of the trees.
+        existence: of the trees, (T,) rows.
         problem, estimate, motion, detections, run: the products on the way.
         held_out: (H,) indices of the fixes withheld from the estimator.
         rejected: trees that did not exist.
@@ -50,8 +55,7 @@ class Solved:
     problem: Problem
     estimate: Estimate
     tree: NDArray[np.int64]
-    score: Array
-    sightings: NDArray[np.int64]
+    existence: Existence
     held_out: NDArray[np.int64]
     rejected: int
     loops: int
@@ -88,7 +92,7 @@ def solve_run(
         notes.append("no wheel odometry: the motion between poses rests on GNSS fixes, IMU and trunks")
     if not motion.gyro:
         notes.append("no IMU: turns rest on the wheels, the slope on GNSS and trunks")
-    detections = Detections.of(run.trunks)
+    detections, track = _screened(Detections.of(run.trunks), motion, config, notes)
     n_fix = len(run.streams.fix_ns)
     used = np.ones(n_fix, bool)
     if check_fixes > 0:
@@ -111,22 +115,33 @@ def solve_run(
     if known is not None:
         problem = replace(problem, known=_known_trees(known, detections))
     seconds = {"read": run.seconds}
-    tree, problem, estimate, score, hits, rejected, loops = _associate_and_solve(problem, config, progress)
+    tree, problem, estimate, existence, rejected, loops = _associate_and_solve(problem, track, config, progress)
     seconds["associate and solve"] = time.perf_counter() - began
     return Solved(
         run,
         motion,
-        detections,
+        problem.detections,
         problem,
         estimate,
         tree,
-        score,
-        hits,
+        existence,
         np.flatnonzero(~used),
         rejected,
         loops,
         seconds,
     )
+
+
+def _screened(
+    detections: Detections, motion: Motion, config: Config, notes: list[str]
+) -> tuple[Detections, NDArray[np.int64]]:
+    """The detections that may be of landmarks, and their tracks, numbered without gaps."""
+    track = follow(detections, motion, config.trees)
+    screened = screen(detections, track, motion)
+    if screened.moved:
+        notes.append(f"{screened.moved} things that moved, or rode along with the robot, were left out")
+    keep = screened.keep
+    return detections.select(keep), np.unique(track[keep], return_inverse=True)[1].astype(np.int64)
 
 
 def _known_trees(topo: TopoMap, detections: Detections) -> KnownTrees:
@@ -157,13 +172,10 @@ def _keyframes(detections: Detections, motion: Motion, config: Config) -> NDArra
 class _Association:
     """The state of associate <-> solve: tracks, their trees, and the problem that follows from them."""
 
-    def __init__(self, problem: Problem, config: Config) -> None:
-        d = problem.detections
+    def __init__(self, problem: Problem, track: NDArray[np.int64], config: Config) -> None:
         self.problem, self.config = problem, config
-        self.track = follow(d, problem.motion, config.trees)
+        self.track = track
         self.tracks = int(self.track.max(initial=-1)) + 1
-        self.distance = problem.motion.distance_at(d.stamps_ns)[d.scan] if len(d) else np.zeros(0)
-        self.variance = 0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1])
         self.known = len(problem.known.p) if problem.known is not None else 0
         self.closer = LoopCloser(self.tracks + self.known, problem.motion.gyro, config.trees, config.motion)
         self.tree_of_track = self.closer.tree
@@ -175,18 +187,19 @@ class _Association:
     def table(self, e: Estimate) -> TrackTable:
         """Tracks in the map as estimated; trees of an earlier map are tracks seen long ago."""
         d = self.problem.detections
-        xy = transform(self.poses(e)[d.scan], d.p)[:, :2]
-        t = tabulate(xy, self.variance, self.track, self.distance)
+        t = tabulate(d, self.track, self.poses(e), self.problem.motion.distance_at(d.stamps_ns))
         k = self.problem.known
         if k is None:
             return t
         long_ago = np.full(self.known, -1e9)
         return TrackTable(
-            np.concatenate([t.place, k.p[:, :2]]),
-            np.concatenate([t.sigma, np.sqrt(0.5 * (k.cov[:, 0, 0] + k.cov[:, 1, 1]))]),
-            np.concatenate([t.first, long_ago]),
-            np.concatenate([t.last, long_ago]),
-            np.concatenate([t.hits, np.full(self.known, 1000)]),
+            place=np.concatenate([t.place, k.p[:, :2]]),
+            foot=np.concatenate([t.foot, k.p[:, :2]]),
+            width=np.concatenate([t.width, np.zeros(self.known)]),
+            sigma=np.concatenate([t.sigma, np.sqrt(0.5 * (k.cov[:, 0, 0] + k.cov[:, 1, 1]))]),
+            first=np.concatenate([t.first, long_ago]),
+            last=np.concatenate([t.last, long_ago]),
+            hits=np.concatenate([t.hits, np.full(self.known, 1000)]),
         )
 
     def solve(self, e: Estimate, *, least: int = 3, patient: bool = False, link: Link | None = None) -> Estimate:
@@ -201,6 +214,29 @@ class _Association:
         self.problem, _, _ = self.with_trees(self.tree_of_track, least)
         self.problem = replace(self.problem, start=e.map_T_robot)
         return graph.solve(self.problem, self.config.estimate, quick=True, patient=patient)
+
+    def decide(self, e: Estimate) -> tuple[NDArray[np.int64], Problem, Existence, int]:
+        """Tree (N,) of each detection, the problem of the trees that exist with their own axes, what was decided of them,
+        and how many do not exist, given an estimate.
+        """
+        c, d = self.config.trees, self.problem.detections
+        t = self.table(e)
+        self.tree_of_track = refine(t, self.tree_of_track, c)
+        map_T_scan = self.poses(e)
+        _, tree, ids = self.with_trees(self.tree_of_track, 1)
+        seen = transform(map_T_scan[d.scan], d.p)
+        count = np.maximum(np.bincount(tree, minlength=len(ids)), 1)
+        places = np.stack([np.bincount(tree, seen[:, k], minlength=len(ids)) / count for k in range(3)], axis=1)
+        found = exists(d, tree, map_T_scan, places, c)
+        keep = np.zeros(int(self.tree_of_track.max(initial=-1)) + 1, bool)
+        keep[ids[found.ok]] = True
+        if self.problem.known is not None:  # what the map knows exists, however rarely this run saw it
+            keep[self.tree_of_track[self.tracks :]] = True
+        problem, tree, final = self.with_trees(self.tree_of_track, 1, keep)
+        own = relevelled(d, tree, map_T_scan, shapes(d, tree, map_T_scan, len(final)))
+        sightings = gather(own, tree, problem.stamps_ns, problem.motion)
+        problem = replace(problem, start=e.map_T_robot, detections=own, sightings=sightings)
+        return tree, problem, found.select(np.searchsorted(ids, final)), int((~found.ok).sum())
 
     def with_trees(
         self, tree_of_track: NDArray[np.int64], least: int, keep: NDArray[np.bool_] | None = None
@@ -223,23 +259,16 @@ class _Association:
 
 
 def _associate_and_solve(
-    problem: Problem, config: Config, progress: Progress
-) -> tuple[NDArray[np.int64], Problem, Estimate, Array, NDArray[np.int64], int, int]:
+    problem: Problem, track: NDArray[np.int64], config: Config, progress: Progress
+) -> tuple[NDArray[np.int64], Problem, Estimate, Existence, int, int]:
     d = problem.detections
     estimate = graph.solve(problem, config.estimate, quick=True)
     if not len(d):
         problem = replace(problem, start=estimate.map_T_robot)
         none = np.zeros(0, np.int64)
-        return (
-            none,
-            problem,
-            replace(graph.solve(problem, config.estimate), tree=none),
-            np.zeros(0),
-            none,
-            0,
-            0,
-        )
-    a = _Association(problem, config)
+        nothing = exists(d, none, np.zeros((0, 4, 4)), np.zeros((0, 3)), config.trees)
+        return none, problem, replace(graph.solve(problem, config.estimate), tree=none), nothing, 0, 0
+    a = _Association(problem, track, config)
     end = float(problem.motion.distance[-1])
     cap = _gnss_cap(problem, a.closer)
     while a.closer.advance(a.table(estimate), end, cap):
@@ -252,35 +281,23 @@ def _associate_and_solve(
     for n, patience in enumerate((4.0, 2.0, 1.0)):
         progress("refine", n / 3)
         t = a.table(estimate)
-        a.tree_of_track = refine(t.place, t.sigma, t.hits, a.tree_of_track, config.trees, patience)
+        a.tree_of_track = refine(t, a.tree_of_track, config.trees, patience)
         estimate = a.solve(estimate, patient=True)
-    t = a.table(estimate)
-    a.tree_of_track = refine(t.place, t.sigma, t.hits, a.tree_of_track, config.trees)
-    problem, tree, ids = a.with_trees(a.tree_of_track, 1)
-    map_T_scan = a.poses(estimate)
-    seen = transform(map_T_scan[d.scan], d.p)
-    count = np.maximum(np.bincount(tree, minlength=len(ids)), 1)
-    places = np.stack([np.bincount(tree, seen[:, k], minlength=len(ids)) / count for k in range(3)], axis=1)
-    ok, score, hits, _ = exists(d, tree, map_T_scan, places, config.trees)
-    keep = np.zeros(int(a.tree_of_track.max(initial=-1)) + 1, bool)
-    keep[ids[ok]] = True
-    if problem.known is not None:  # what the map knows exists, however rarely this run saw it
-        keep[a.tree_of_track[a.tracks :]] = True
-    problem, tree, final = a.with_trees(a.tree_of_track, 1, keep)
     progress("solve", 0.0)
-    problem = replace(problem, start=estimate.map_T_robot)
-    estimate = graph.solve(problem, config.estimate)
+    decided = a.decide(estimate)
+    for n in range(LAST_ROUNDS):
+        tree, problem, existence, rejected = decided
+        estimate = replace(graph.solve(problem, config.estimate), tree=tree)
+        progress("solve", (n + 1) / LAST_ROUNDS)
+        decided = a.decide(estimate)
+        if np.array_equal(decided[0], tree):
+            break
     progress("solve", 1.0)
-    place = np.searchsorted(ids, final)
-    return (
-        tree,
-        problem,
-        replace(estimate, tree=tree),
-        score[place],
-        hits[place],
-        int((~ok).sum()),
-        a.closer.loops,
-    )
+    return tree, problem, estimate, existence, rejected, a.closer.loops
+
+
+LAST_ROUNDS = 4
+"""Association and solve go on until neither changes, the last solve included; at most so often."""
 
 
 def _link(problem: Problem, estimate: Estimate, closer: LoopCloser) -> Link | None:
@@ -324,14 +341,12 @@ def map_T_scans(solved: Solved) -> Array:
 
 def topo_map(solved: Solved, config: Config, meta: dict[str, str]) -> TopoMap:
     """The map of a solved run."""
-    ordered = sorted(solved.run.trunks, key=lambda t: t.stamp_ns)
-    unique = [t for i, t in enumerate(ordered) if i == 0 or t.stamp_ns > ordered[i - 1].stamp_ns]
     return build(
         solved.estimate,
         solved.detections,
-        unique,
+        in_order(solved.run.trunks),
         map_T_scans(solved),
-        solved.score,
+        solved.existence,
         solved.problem.datum,
         config.topomap,
         meta,
@@ -350,12 +365,21 @@ def baseline(solved: Solved, config: Config) -> tuple[Estimate, TopoMap]:
     tree = np.where(e.tree >= 0, name[np.maximum(e.tree, 0)], -1)
     e = replace(e, trees=e.trees[keep], tree_cov=e.tree_cov[keep], tree=tree)
     poses = path_at(e.stamps_ns, e.map_T_robot, solved.motion, solved.detections.stamps_ns)
+    n = int(keep.sum())
+    all_trees = Existence(
+        ok=np.ones(n, bool),
+        kind=np.zeros(n, np.int64),
+        probability=np.full(n, np.nan),
+        score=np.zeros(n),
+        hits=hits[keep],
+        passed=np.zeros(n, np.int64),
+    )
     topo = build(
         e,
         solved.detections,
         [],
         poses,
-        np.zeros(int(keep.sum())),
+        all_trees,
         solved.problem.datum,
         config.topomap,
         {"method": "thesis"},

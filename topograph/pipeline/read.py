@@ -17,8 +17,8 @@ from topograph.bags import Fix, Heading, Imu, Odometry, Recording, Scan, Trunks
 from topograph.config import Config
 from topograph.errors import InputError
 from topograph.geometry import Array, inverse
-from topograph.motion import Streams, StreamsBuilder, twist_during
-from topograph.trunks import from_recorded
+from topograph.motion import Streams, StreamsBuilder, twist_during, up_at
+from topograph.trunks import from_recorded, smeared
 
 Progress = Callable[[str, float], None]
 WHOLE = (0.0, float("inf"))
@@ -246,8 +246,10 @@ def _detector(recording: Recording, config: Config) -> Callable[[Scan, StreamsBu
         if scan.offset is not None and len(scan.offset):
             first += int(np.nanmin(scan.offset) * 1e9)
             last += int(np.nanmax(scan.offset) * 1e9)
-        twist, _ = twist_during(first, last, streams.odometry, streams.imu, robot_R_imu)
-        return detectors[scan.frame](scan, twist)
+        twist, source = twist_during(first, last, streams.odometry, streams.imu, robot_R_imu)
+        up = up_at(scan.stamp_ns, streams.odometry, streams.imu, robot_R_imu)
+        trunks = detectors[scan.frame](scan, twist, up)
+        return trunks if scan.offset is not None and source != "none" else smeared(trunks, twist, source != "none")
 
     return detect
 

@@ -12,7 +12,7 @@ from topograph.errors import UsageError
 from topograph.evaluate import write_tum
 from topograph.report.figures import cloud_points
 from topograph.report.record import write_text
-from topograph.topomap import TopoMap
+from topograph.topomap import KINDS, TopoMap
 
 
 def write(topo: TopoMap, path: Path) -> None:
@@ -48,6 +48,8 @@ def _geojson(topo: TopoMap) -> dict[str, Any]:
                 "diameter": float(topo.diameter[i]) if np.isfinite(topo.diameter[i]) else None,
                 "sightings": int(topo.sightings[i]),
                 "row": int(topo.row[i]),
+                "kind": KINDS[int(topo.kind[i])],
+                "stems": int(topo.stems[i]),
             },
         }
         for i in range(len(topo))
@@ -57,11 +59,11 @@ def _geojson(topo: TopoMap) -> dict[str, Any]:
 
 def _csv(topo: TopoMap) -> str:
     g = topo.geodetic()
-    lines = ["id,x,y,z,lat,lon,h,diameter,sigma_x,sigma_y,sightings,row"]
+    lines = ["id,x,y,z,lat,lon,h,diameter,sigma_x,sigma_y,sightings,row,kind,kind_probability,stems"]
     for i in range(len(topo)):
         sx, sy = np.sqrt(topo.cov[i, [0, 1], [0, 1]])
         lines.append(
             f"{topo.ids[i]},{topo.p[i, 0]:.4f},{topo.p[i, 1]:.4f},{topo.p[i, 2]:.4f},{g[i, 0]:.9f},{g[i, 1]:.9f},{g[i, 2]:.4f},"
-            f"{topo.diameter[i]:.4f},{sx:.4f},{sy:.4f},{topo.sightings[i]},{topo.row[i]}"
+            f"{topo.diameter[i]:.4f},{sx:.4f},{sy:.4f},{topo.sightings[i]},{topo.row[i]},{KINDS[int(topo.kind[i])]},{topo.kind_probability[i]:.3f},{topo.stems[i]}"
         )
     return "\n".join(lines) + "\n"

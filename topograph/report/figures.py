@@ -19,6 +19,7 @@ from topograph.topomap import TopoMap
 matplotlib.use("Agg")
 
 TREE, EDGE, PATH, TRUE, BAD = "#1b7837", "#b8c4bb", "#2166ac", "#d6604d", "#b2182b"
+POST = "#7b5c3e"
 
 
 def _png(figure: Figure) -> bytes:
@@ -33,8 +34,14 @@ def _axes(width: float = 9.0, height: float = 7.5) -> tuple[Figure, Any]:
 
 
 def map_figure(topo: TopoMap, true_trees: Array | None = None, title: str = "") -> bytes:
-    """The map from above: edges, path, trees with their diameters and ten-fold 95 % ellipses, and the truth if given."""
+    """The map from above: edges, path, trees with their diameters and ten-fold 95 % ellipses, what else stands there, and
+    the truth if given.
+    """
     figure, ax = _axes()
+    others = ~topo.is_tree
+    if others.any():
+        ax.plot(*topo.p[others, :2].T, "s", color=POST, ms=4, zorder=3, label="post, pole")
+    topo = topo.trees()
     for a, b in topo.edges:
         ax.plot(*topo.p[[a, b], :2].T, color=EDGE, lw=0.8, zorder=1)
     if len(topo.stamps_ns):

@@ -13,7 +13,7 @@ import numpy as np
 from topograph.evaluate import Metric
 from topograph.geometry import Array
 from topograph.report.record import write_text
-from topograph.topomap import TopoMap
+from topograph.topomap import KINDS, TopoMap
 
 _STYLE = """
 :root{color-scheme:light dark;--ink:#1d2420;--soft:#5c6a61;--line:#d8dfda;--card:#fff;--page:#f5f7f5;--tree:#1b7837}
@@ -44,7 +44,7 @@ el('polyline',{points:D.path.map(p=>p[0]+','+(-p[1])).join(' '),fill:'none',stro
 D.truth.forEach(p=>{el('path',{d:`M${p[0]-6*u} ${-p[1]}h${12*u}M${p[0]} ${-p[1]-6*u}v${12*u}`,stroke:'#d6604d','stroke-width':1.2*u},g)});
 D.trees.forEach(t=>{
  if(t.e)el('ellipse',{rx:t.e[0]*10,ry:t.e[1]*10,transform:`translate(${t.x} ${-t.y}) rotate(${-t.e[2]})`,fill:'none',stroke:'#1b7837','stroke-width':.7*u},g);
- const c=el('circle',{cx:t.x,cy:-t.y,r:Math.max(t.d/2,2.5*u),fill:'#1b7837'},g);
+ const c=el('circle',{cx:t.x,cy:-t.y,r:Math.max(t.d/2,2.5*u),fill:t.k?'#7b5c3e':'#1b7837'},g);
  c.addEventListener('pointermove',v=>{tip.style.display='block';tip.style.left=v.clientX+12+'px';tip.style.top=v.clientY+12+'px';tip.textContent=t.t});
  c.addEventListener('pointerleave',()=>tip.style.display='none')});
 s.addEventListener('wheel',e=>{e.preventDefault();const r=s.getBoundingClientRect(),f=e.deltaY>0?1.15:1/1.15;
@@ -138,7 +138,7 @@ def _map_data(topo: TopoMap, true_trees: Array | None) -> dict[str, object]:
             sigma = f", σ {100 * np.sqrt(max(values)):.1f} cm"
         place = "" if topo.datum is None else f", {geodetic[i, 0]:.7f}°, {geodetic[i, 1]:.7f}°"
         row = "" if topo.row[i] < 0 else f", row {topo.row[i]}"
-        text = f"tree {topo.ids[i]}: Ø {100 * d:.0f} cm, {topo.sightings[i]} sightings{sigma}{row}{place}"
+        text = f"{KINDS[int(topo.kind[i])]} {topo.ids[i]}: Ø {100 * d:.0f} cm, {topo.sightings[i]} sightings{sigma}{row}{place}"
         trees.append(
             {
                 "x": round(float(topo.p[i, 0]), 3),
@@ -146,6 +146,7 @@ def _map_data(topo: TopoMap, true_trees: Array | None) -> dict[str, object]:
                 "d": round(d, 3),
                 "e": ellipse,
                 "t": text,
+                "k": int(topo.kind[i]),
             }
         )
     every = max(1, len(topo.stamps_ns) // 3000)

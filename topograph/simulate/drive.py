@@ -60,7 +60,7 @@ def _waypoints(orchard: Orchard, run: int) -> Array:
         points += [(first - 1.5, alleys[0] + 0.5), (first, alleys[0])]
         xy = np.array(points)
         return xy[::-1] if run == 2 else xy
-    if c.layout == "hedgerow":  # too narrow to cross a row: weave within the alley
+    if c.layout in ("hedgerow", "wild"):  # too narrow to cross a row: weave within the alley
         x = np.linspace(first, last, 40)
         sides = [np.stack([x, y + 0.7 * np.sin(x)], axis=1) for y in alleys[:2]]
         return np.concatenate([sides[0], sides[1][::-1], sides[0][:1]])

@@ -10,27 +10,33 @@ from numpy.typing import NDArray
 
 from topograph.geometry import Array
 from topograph.simulate.config import SensorConfig
-from topograph.simulate.orchard import CELL, GRASS, GROUND, Orchard, Shapes, person
+from topograph.simulate.ground import CELL
+from topograph.simulate.growth import GRASS, GROUND, METAL, TRUNK, WOOD, Shapes, person
+from topograph.simulate.orchard import Orchard
+from topograph.simulate.sensors import mounting
 
 _BINS = 720
+TRACED = 1.75
+"""Height up to which returns of a trunk are labelled as trunk, m."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
     """Returns of one sweep in firing order: xyz (N, 3) in the moving sensor's frame, ring, seconds since the
-    sweep began, intensity, and the tree hit (-1: none)."""
+    sweep began, intensity, the tree hit (branches too; -1: none) and the material (-1: a mixed pixel)."""
 
     xyz: NDArray[np.float32]
     ring: NDArray[np.uint16]
     time: NDArray[np.float32]
     intensity: NDArray[np.float32]
     tree: NDArray[np.int32]
+    material: NDArray[np.int8]
 
 
 def elevations(config: SensorConfig) -> tuple[Array, NDArray[np.int64]]:
     """Elevation (R,) in rad of each laser in firing order, and its ring. Velodyne fires low and high in turn."""
     n = config.rings
-    angles = np.linspace(config.fov[0], config.fov[1], n)
+    angles = np.array(config.elevation) if config.elevation else np.linspace(config.fov[0], config.fov[1], n)
     order = np.arange(n).reshape(2, n // 2).T.ravel() if n % 2 == 0 else np.arange(n)
     return angles[order], order
 
@@ -39,24 +45,46 @@ def sweep(orchard: Orchard, config: SensorConfig, world_T_lidar: Array, time_s: 
     """One sweep; `world_T_lidar` (columns, 4, 4) is the sensor's pose at each firing."""
     angles, order = elevations(config)
     shapes = orchard.shapes
+    robot = world_T_lidar[len(world_T_lidar) // 2] @ np.linalg.inv(mounting(config))
     moving = [
         part
         for x, y, vx, vy in orchard.walkers
         for part in _walker(orchard, np.array([x, y]), np.array([vx, vy]), time_s)
     ]
+    for k in range(orchard.config.companions):
+        moving += _companion(orchard, robot, k, time_s)
+    cylinders = shapes.cylinders
+    if config.mast:
+        foot = robot[:3, :3] @ [-0.6, 0.3, 0.3] + robot[:3, 3]
+        mast = [*foot, *robot[:3, 2], 1.8, 0.03, 0.03, METAL, -1]
+        cylinders = np.concatenate([cylinders, [mast]])
     blobs = np.concatenate([shapes.blobs, np.array(moving).reshape(-1, 9)])
     centre = world_T_lidar[len(world_T_lidar) // 2, :3, 3]
-    lists = [
-        _near(a, centre, size, config.max_range) for a, size in _bounds(Shapes(shapes.cylinders, blobs, shapes.boxes))
-    ]
+    lists = [_near(a, centre, size, config.max_range) for a, size in _bounds(Shapes(cylinders, blobs, shapes.boxes))]
     g = orchard.ground
-    xyz, laser, column, intensity, tree = _cast(
-        np.ascontiguousarray(world_T_lidar), angles, shapes.cylinders, blobs, shapes.boxes, *lists,
-        g.origin, g.height, g.grass, config.max_range, config.range_sigma, config.dropout, config.divergence, seed,
+    bias = config.ring_bias * np.random.default_rng([17, config.rings]).normal(size=len(angles))
+    xyz, laser, column, intensity, tree, material = _cast(
+        np.ascontiguousarray(world_T_lidar), angles, bias, cylinders, blobs, shapes.boxes, *lists,
+        g.origin, g.height, g.grass, config.max_range, config.range_sigma, config.dropout, config.divergence, config.bark, seed,
     )  # fmt: skip
     per_column = 1.0 / (config.sweep_hz * config.columns)
     time = (column + laser / (1.5 * len(angles))) * per_column
-    return Sweep(xyz, order[laser].astype(np.uint16), time.astype(np.float32), intensity, tree)
+    ring = len(angles) - 1 - order[laser] if config.from_top else order[laser]
+    out = Sweep(xyz, ring.astype(np.uint16), time.astype(np.float32), intensity, tree, material)
+    if config.twice:
+        every = np.repeat(np.arange(len(xyz)), 2)
+        out = Sweep(
+            out.xyz[every], out.ring[every], out.time[every], out.intensity[every], out.tree[every], out.material[every]
+        )
+    return out
+
+
+def _companion(orchard: Orchard, robot: Array, number: int, time_s: float) -> list[list[float]]:
+    """A person who keeps a place beside the robot, swaying a little with the steps."""
+    x, y = orchard.config.beside
+    sway = 0.06 * np.sin(2.1 * time_s + number)
+    xy = (robot[:3, :3] @ [x + sway, y * (-1) ** number, 0.0] + robot[:3, 3])[:2]
+    return person(np.array([*xy, float(orchard.ground.at(xy))]), 1.5 * time_s)
 
 
 def _walker(orchard: Orchard, start: Array, velocity: Array, time_s: float) -> list[list[float]]:
@@ -233,15 +261,16 @@ def _trace(o, d, cyl, blob, box, near_c, near_b, near_x, origin, height, grass, 
 
 
 @njit(cache=True)
-def _cast(poses, angles, cyl, blob, box, near_c, near_b, near_x, origin, height, grass,
-          most, sigma, dropout, divergence, seed):  # fmt: skip
+def _cast(poses, angles, bias, cyl, blob, box, near_c, near_b, near_x, origin, height, grass,
+          most, sigma, dropout, divergence, rough, seed):  # fmt: skip
     np.random.seed(seed)
     columns, lasers = poses.shape[0], angles.shape[0]
     n_max = columns * lasers
     xyz = np.empty((n_max, 3), np.float32)
     laser_of, column_of = np.empty(n_max, np.int64), np.empty(n_max, np.int64)
     intensity, tree_of = np.empty(n_max, np.float32), np.empty(n_max, np.int32)
-    reflect = np.array([35.0, 25.0, 22.0, 14.0, 30.0, 60.0, 40.0])
+    material_of = np.empty(n_max, np.int8)
+    reflect = np.array([35.0, 25.0, 22.0, 14.0, 30.0, 60.0, 40.0, 35.0, 45.0])
     n = 0
     for col in range(columns):
         T = poses[col]
@@ -265,12 +294,14 @@ def _cast(poses, angles, cyl, blob, box, near_c, near_b, near_x, origin, height,
             t, material, tree = _trace(o, d1, cyl, blob, box, near_c, near_b, near_x, origin, height, grass, most)
             d2 = d - a * side
             d2 /= np.sqrt((d2 * d2).sum())
+            mixed = False
             if np.random.random() < 0.5:  # the beam's other half: mixed pixels at edges
                 t2, m2, tree2 = _trace(o, d2, cyl, blob, box, near_c, near_b, near_x, origin, height, grass, most)
                 if m2 >= 0 and material >= 0 and 0.1 < abs(t2 - t) < 1.5 and np.random.random() < 0.5:
                     w = np.random.random()
                     t = w * t + (1 - w) * t2
                     tree = -1
+                    mixed = True
                 elif m2 >= 0 and t2 < t:
                     t, material, tree = t2, m2, tree2
             if material < 0 or t >= most or t < 0.5:
@@ -281,12 +312,17 @@ def _cast(poses, angles, cyl, blob, box, near_c, near_b, near_x, origin, height,
             if tree >= 0:
                 z = o[2] + t * d[2]
                 bark = 0.008 * np.sin(9.0 * z + tree) + 0.006 * np.sin(23.0 * z + 7.0 * np.arctan2(d[1], d[0]))
-            r = t + bark + sigma * np.random.standard_normal()
+            r = t + rough * bark + bias[las] + sigma * np.random.standard_normal()
             r = 0.002 * np.round(r / 0.002)
             for k in range(3):
                 xyz[n, k] = r * s[k]
             laser_of[n], column_of[n] = las, col
             intensity[n] = max(0.0, min(255.0, reflect[material] * np.random.uniform(0.4, 1.6)))
             tree_of[n] = tree
+            if material == TRUNK:  # a trunk is what can be traced; above it is wood as the branches are
+                x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
+                if z - _ground_at(x, y, origin, height) > TRACED:
+                    material = WOOD
+            material_of[n] = -1 if mixed else material
             n += 1
-    return xyz[:n], laser_of[:n], column_of[:n], intensity[:n], tree_of[:n]
+    return xyz[:n], laser_of[:n], column_of[:n], intensity[:n], tree_of[:n], material_of[:n]

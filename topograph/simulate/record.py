@@ -17,6 +17,7 @@ from topograph.simulate import sensors
 from topograph.simulate.config import DESIGNS, DriveConfig, OrchardConfig, SensorConfig
 from topograph.simulate.detections import DetectionNoise, detect
 from topograph.simulate.drive import Drive, drive
+from topograph.simulate.growth import TRUNK
 from topograph.simulate.lidar import Sweep, sweep
 from topograph.simulate.orchard import Orchard, plant
 
@@ -56,7 +57,8 @@ def record(
     scan_stamps: list[int] = []
     with BagWriter(path, sensor.compression) as bag:
         start = int(way.stamps_ns[0])
-        bag.tf_static(start, {("base_link", name): T for name, T in sensors.MOUNTS.items()})
+        mounts = sensors.MOUNTS | {"velodyne": sensors.mounting(sensor)}
+        bag.tf_static(start, {("base_link", name): T for name, T in mounts.items()})
         streams = [_small(bag, way, sensor, datum, rng)]
         if sensor.detections:
             streams.append(_trunks(bag, scene, way, sensor, noise or DetectionNoise(), rng))
@@ -132,7 +134,8 @@ def _clouds(
             )
             bag.points("/velodyne_points", end + 5_000_000, end, "velodyne", _view(s, span * 1e-9))
             stamps.append(end)
-            seen.append(np.bincount(s.tree[s.tree >= 0], minlength=len(scene.trees))[: len(scene.trees)])
+            trunk = s.tree[(s.tree >= 0) & (s.material == TRUNK)]
+            seen.append(np.bincount(trunk, minlength=len(scene.trees))[: len(scene.trees)])
 
         yield end + 5_000_000, write
 

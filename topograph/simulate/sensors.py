@@ -171,7 +171,12 @@ def columns(drive: Drive, config: SensorConfig, start_ns: int) -> Array:
     span_ns = int(1e9 / config.sweep_hz)
     knots = start_ns + np.linspace(0, span_ns, 11).astype(np.int64)
     fine = start_ns + (np.arange(config.columns) * (span_ns / config.columns)).astype(np.int64)
-    return interpolate(knots, drive.at(knots) @ MOUNTS["velodyne"], fine)
+    return interpolate(knots, drive.at(knots) @ mounting(config), fine)
+
+
+def mounting(config: SensorConfig) -> Array:
+    """base_T_lidar (4, 4)."""
+    return MOUNTS["velodyne"] if config.mount is None else from_xyz_rpy(*config.mount)
 
 
 def level(yaw: Array) -> Array:

@@ -2,8 +2,8 @@
 
 from topograph.topomap.build import build
 from topograph.topomap.edges import TopomapConfig, neighbours
-from topograph.topomap.map import TopoMap, Viewpoint
+from topograph.topomap.map import KINDS, TopoMap, Viewpoint
 from topograph.topomap.merge import merge
 from topograph.topomap.rows import find_rows
 
-__all__ = ["TopoMap", "TopomapConfig", "Viewpoint", "build", "find_rows", "merge", "neighbours"]
+__all__ = ["KINDS", "TopoMap", "TopomapConfig", "Viewpoint", "build", "find_rows", "merge", "neighbours"]

@@ -11,10 +11,10 @@ from topograph.bags import Trunks
 from topograph.estimate import Estimate
 from topograph.geometry import Array, Datum
 from topograph.topomap.clouds import register
-from topograph.topomap.edges import TopomapConfig, neighbours
+from topograph.topomap.edges import TopomapConfig, among
 from topograph.topomap.map import TopoMap, Viewpoint
 from topograph.topomap.rows import find_rows
-from topograph.trees import Detections
+from topograph.trees import TREE, Detections, Existence, shapes
 
 
 def build(
@@ -22,54 +22,45 @@ def build(
     detections: Detections,
     trunks: Sequence[Trunks],
     map_T_scan: Array,
-    score: Array,
+    existence: Existence,
     datum: Datum | None,
     config: TopomapConfig,
     meta: dict[str, str],
 ) -> TopoMap:
-    """The map of an estimate. `trunks` are the scans' trunks with their clouds, in the order of `detections`."""
-    n = len(estimate.trees)
-    tree, axes, hits = estimate.tree, np.zeros((n, 3)), np.zeros(n, np.int64)
-    diameter, height, spread = np.full(n, np.nan), np.zeros(n), np.zeros(n)
-    map_axis = (map_T_scan[detections.scan, :3, :3] @ detections.axis[:, :, None])[..., 0]
-    order = np.argsort(tree, kind="stable")
-    ends = np.searchsorted(tree[order], np.arange(n + 1))
-    for j in range(n):
-        mine = order[ends[j] : ends[j + 1]]
-        hits[j] = len(mine)
-        axes[j], spread[j] = _axis(map_axis[mine], detections.p[mine])
-        known = detections.diameter[mine][np.isfinite(detections.diameter[mine])]
-        diameter[j] = np.median(known) if len(known) else np.nan
-        above = detections.height[mine][np.isfinite(detections.height[mine])]
-        height[j] = np.median(above) if len(above) else 0.0
-    foot = estimate.trees - axes * (height / np.maximum(axes[:, 2], 0.3))[:, None]
+    """The map of an estimate. `trunks` are the scans' trunks with their clouds; `detections.source` counts in them."""
+    n, tree = len(estimate.trees), estimate.tree
+    s = shapes(detections, tree, map_T_scan, n)
+    foot = estimate.trees - s.axis * (s.height / np.maximum(s.axis[:, 2], 0.3))[:, None]
     cov = estimate.tree_cov.copy()
     # The foot lies `height` below what was measured: the lean's error carries over.
-    lean_var = (height * np.hypot(0.02, 0.4 * spread)) ** 2
-    cov[:, [0, 1], [0, 1]] += lean_var[:, None]
+    cov[:, [0, 1], [0, 1]] += (s.height**2 * s.slope_var)[:, None]
     viewpoints = _viewpoints(foot, tree, detections, trunks, map_T_scan, config)
-    edges = neighbours(foot[:, :2], config)
+    is_tree = existence.kind == TREE
+    edges = among(foot[:, :2], is_tree, config)
+    row = np.full(n, -1, np.int64)
+    row[is_tree] = find_rows(foot[is_tree, :2], estimate.map_T_robot[:, :2, 3])
     return TopoMap(
-        datum, np.arange(1, n + 1), foot, cov, axes, diameter, _first_branch(n, viewpoints, axes), hits, score,
-        find_rows(foot[:, :2], estimate.map_T_robot[:, :2, 3]), edges,
-        np.linalg.norm(foot[edges[:, 0]] - foot[edges[:, 1]], axis=1), viewpoints, estimate.stamps_ns,
-        estimate.map_T_robot, estimate.datum_cov, meta,
-    )  # fmt: skip
-
-
-def _axis(axes: Array, p: Array) -> tuple[Array, float]:
-    """Axis (3,) of one tree and its uncertainty, rad, from sightings' axes (N, 3) in the map frame, seen at `p` (N, 3).
-
-    From afar one or two rings cross a trunk and its lean is a guess; the nearest third of the sightings decides.
-    """
-    if len(axes) == 0:
-        return np.array([0.0, 0.0, 1.0]), 0.1
-    far = np.hypot(p[:, 0], p[:, 1])
-    near = axes[far <= max(float(np.percentile(far, 33)), 4.0)]
-    mean = np.median(near, axis=0)
-    # Stems and bends: the views do not agree on one axis, however many they are.
-    spread = 1.4826 * float(np.median(np.linalg.norm(near[:, :2] - mean[:2], axis=1))) / 1.177
-    return np.asarray(mean / np.linalg.norm(mean)), spread
+        datum=datum,
+        ids=np.arange(1, n + 1),
+        p=foot,
+        cov=cov,
+        axis=s.axis,
+        diameter=s.diameter,
+        first_branch=_first_branch(n, viewpoints, s.axis),
+        sightings=np.bincount(tree[tree >= 0], minlength=n),
+        score=existence.score,
+        row=row,
+        kind=existence.kind,
+        kind_probability=existence.probability,
+        stems=s.stems,
+        edges=edges,
+        lengths=np.linalg.norm(foot[edges[:, 0]] - foot[edges[:, 1]], axis=1),
+        viewpoints=viewpoints,
+        stamps_ns=estimate.stamps_ns,
+        map_T_robot=estimate.map_T_robot,
+        datum_cov=estimate.datum_cov,
+        meta=meta,
+    )
 
 
 def _viewpoints(
@@ -77,8 +68,9 @@ def _viewpoints(
     config: TopomapConfig,
 ) -> tuple[Viewpoint, ...]:  # fmt: skip
     clouds = [c for t in trunks for c in (t.clouds or [np.zeros((0, 3), np.float32)] * len(t))]
-    if len(clouds) != len(tree) or not any(map(len, clouds)):
+    if not any(map(len, clouds)):
         return ()
+    clouds = [clouds[k] for k in detections.source.tolist()]
     size = np.array([len(c) for c in clouds])
     out: list[Viewpoint] = []
     for j in range(len(foot)):

@@ -76,3 +76,9 @@ def _delaunay_pairs(xy: Array) -> NDArray[np.int64]:
         return np.array(pairs, np.int64).reshape(-1, 2)
     edges = np.concatenate([simplices[:, [0, 1]], simplices[:, [1, 2]], simplices[:, [2, 0]]])
     return np.asarray(np.unique(np.sort(edges, axis=1), axis=0), np.int64)
+
+
+def among(xy: Array, chosen: NDArray[np.bool_], config: TopomapConfig) -> NDArray[np.int64]:
+    """Edges (E, 2), rows of `xy` (T, 2), between the `chosen` (T,) alone."""
+    rows = np.flatnonzero(chosen)
+    return np.asarray(rows[neighbours(xy[rows], config)], np.int64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,12 @@ class Viewpoint:
     cloud: NDArray[np.float32]
 
 
-@dataclass(frozen=True, slots=True)
+KINDS = ("tree", "post", "other")
+"""What a landmark can be."""
+TREE = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TopoMap:
     """Nodes, edges and the path that saw them, in the `map` frame (ENU at `datum`, or local when that is None).
 
@@ -31,6 +36,7 @@ class TopoMap:
         p: (T, 3) where the trunk's axis meets the ground, m; `cov` (T, 3, 3) m².
         axis: (T, 3) unit vectors, up; `diameter` (T,) m or NaN; `first_branch` (T,) m above ground or NaN.
         sightings, score, row: (T,); row -1 where there are no rows.
+        kind: (T,) index into KINDS; `kind_probability` (T,) or NaN; `stems` (T,). Edges and rows are of trees alone.
         edges: (E, 2) rows of the arrays; `lengths` (E,) m.
         viewpoints: clouds by viewpoint.
         stamps_ns, map_T_robot: (K,), (K, 4, 4).
@@ -48,6 +54,9 @@ class TopoMap:
     sightings: NDArray[np.int64]
     score: Array
     row: NDArray[np.int64]
+    kind: NDArray[np.int64]
+    kind_probability: Array
+    stems: NDArray[np.int64]
     edges: NDArray[np.int64]
     lengths: Array
     viewpoints: tuple[Viewpoint, ...]
@@ -58,6 +67,61 @@ class TopoMap:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    @staticmethod
+    def of_points(xy: Array, sigma: float = 0.01) -> TopoMap:
+        """A local map of bare trees at `xy` (T, 2), known to `sigma` m: no path, no edges."""
+        n = len(xy)
+        unknown = np.full(n, np.nan)
+        return TopoMap(
+            datum=None,
+            ids=np.arange(1, n + 1),
+            p=np.column_stack([xy, np.zeros(n)]),
+            cov=np.tile(sigma**2 * np.eye(3), (n, 1, 1)),
+            axis=np.tile([0.0, 0.0, 1.0], (n, 1)),
+            diameter=unknown,
+            first_branch=unknown,
+            sightings=np.ones(n, np.int64),
+            score=np.zeros(n),
+            row=np.full(n, -1),
+            kind=np.full(n, TREE),
+            kind_probability=unknown,
+            stems=np.ones(n, np.int64),
+            edges=np.zeros((0, 2), np.int64),
+            lengths=np.zeros(0),
+            viewpoints=(),
+            stamps_ns=np.zeros(0, np.int64),
+            map_T_robot=np.zeros((0, 4, 4)),
+            datum_cov=np.zeros((3, 3)),
+        )
+
+    @property
+    def is_tree(self) -> NDArray[np.bool_]:
+        """(T,) landmarks that are trees."""
+        return np.asarray(self.kind == TREE)
+
+    def trees(self) -> TopoMap:
+        """The map without its landmarks that are no trees; itself where there are none."""
+        keep = self.is_tree
+        if keep.all():
+            return self
+        row = np.cumsum(keep) - 1
+        per_row = (
+            "ids",
+            "p",
+            "cov",
+            "axis",
+            "diameter",
+            "first_branch",
+            "sightings",
+            "score",
+            "row",
+            "kind",
+            "kind_probability",
+            "stems",
+        )
+        views = tuple(replace(v, tree=int(row[v.tree])) for v in self.viewpoints if keep[v.tree])
+        return replace(self, edges=row[self.edges], viewpoints=views, **{k: getattr(self, k)[keep] for k in per_row})
 
     def geodetic(self) -> Array:
         """(T, 3) latitude, longitude (degrees) and height (m) of the nodes; NaN when not georeferenced."""

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from topograph.geometry import Array
-from topograph.topomap.edges import TopomapConfig, neighbours
-from topograph.topomap.map import TopoMap, Viewpoint
+from topograph.topomap.edges import TopomapConfig, among
+from topograph.topomap.map import TREE, TopoMap, Viewpoint
 from topograph.topomap.rows import find_rows
 
 
@@ -47,11 +47,31 @@ def merge(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64], config: To
             views.append(moved)
         elif len(v.cloud) > len(views[twin[0]].cloud):
             views[twin[0]] = moved
-    edges = neighbours(p[:, :2], config)
+    kind = both("kind").astype(np.int64)
+    edges = among(p[:, :2], kind == TREE, config)
     stamps = np.concatenate([old.stamps_ns, new.stamps_ns])
     poses = np.concatenate([old.map_T_robot, new.map_T_robot])
+    row = np.full(len(p), -1, np.int64)
+    row[kind == TREE] = find_rows(p[kind == TREE, :2], poses[:, :2, 3])
     return TopoMap(
-        old.datum, ids.astype(np.int64), p, both("cov"), both("axis"), both("diameter"), both("first_branch"), sightings,
-        both("score"), find_rows(p[:, :2], poses[:, :2, 3]), edges, np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1),
-        tuple(views), stamps, poses, old.datum_cov, new.meta,
-    )  # fmt: skip
+        datum=old.datum,
+        ids=ids.astype(np.int64),
+        p=p,
+        cov=both("cov"),
+        axis=both("axis"),
+        diameter=both("diameter"),
+        first_branch=both("first_branch"),
+        sightings=sightings,
+        score=both("score"),
+        row=row,
+        kind=kind,
+        kind_probability=both("kind_probability"),
+        stems=both("stems").astype(np.int64),
+        edges=edges,
+        lengths=np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1),
+        viewpoints=tuple(views),
+        stamps_ns=stamps,
+        map_T_robot=poses,
+        datum_cov=old.datum_cov,
+        meta=new.meta,
+    )

@@ -1,16 +1,23 @@
 """Trunks + a predicted path -> which trunks are one tree: tracking, loop closing, births and deaths."""
 
-from topograph.trees.detections import Detections
-from topograph.trees.existence import exists
+from topograph.trees.detections import Detections, in_order
+from topograph.trees.existence import OTHER, POST, TREE, Existence, exists
 from topograph.trees.keyframes import choose_keyframes
 from topograph.trees.loops import LoopCloser, TrackTable, moved_pose, tabulate
 from topograph.trees.refine import refine
+from topograph.trees.screen import screen
+from topograph.trees.shape import Shapes, relevelled, shapes
 from topograph.trees.sightings import Sightings, gather
 from topograph.trees.tracks import TreesConfig, follow
 
 __all__ = [
+    "OTHER",
+    "POST",
+    "TREE",
     "Detections",
+    "Existence",
     "LoopCloser",
+    "Shapes",
     "Sightings",
     "TrackTable",
     "TreesConfig",
@@ -18,7 +25,11 @@ __all__ = [
     "exists",
     "follow",
     "gather",
+    "in_order",
     "moved_pose",
     "refine",
+    "relevelled",
+    "screen",
+    "shapes",
     "tabulate",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,11 @@ from numpy.typing import NDArray
 from topograph.bags import Trunks
 from topograph.geometry import Array, Stamps
 
+SECTORS = 360
+"""Words of a scan's record of passage (trunks/passage.py)."""
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Detections:
     """N trunks of S scans, sorted by scan; all in `base_link` at the scan's stamp.
 
@@ -21,6 +24,11 @@ class Detections:
         scan: (N,) index of the scan.
         p: (N, 3) on the axis, m; `cov` (N, 3, 3); `axis` (N, 3); `height` (N,) of p above ground or NaN;
         diameter: (N,) m or NaN; `score` (N,) log-odds.
+        kinds: (N, 3) log-probabilities of tree, post, other; NaN where the source tells no kinds.
+        measured: (N, 6) as in `Trunks`; zeros where nothing was measured.
+        stems: (N,).
+        source: (N,) row among all trunks of the run, in the order of the scans.
+        free: (S, 360) what each scan saw through, or (0, 360); `eye` (S, 3) the sensor in `base_link`.
     """
 
     stamps_ns: Stamps
@@ -31,27 +39,56 @@ class Detections:
     height: Array
     diameter: Array
     score: Array
+    kinds: Array
+    measured: Array
+    stems: NDArray[np.int64]
+    source: NDArray[np.int64]
+    free: NDArray[np.uint32]
+    eye: Array
 
     def __len__(self) -> int:
         return len(self.scan)
 
     @staticmethod
     def of(trunks: Sequence[Trunks]) -> Detections:
-        """Flat arrays of trunks given scan by scan, already in `base_link`; scans are put in time order."""
-        ordered = sorted(trunks, key=lambda t: t.stamp_ns)
-        unique = [t for i, t in enumerate(ordered) if i == 0 or t.stamp_ns > ordered[i - 1].stamp_ns]
+        """Flat arrays of trunks given scan by scan, already in `base_link`."""
+        unique = in_order(trunks)
+        count = [len(t) for t in unique]
 
-        def rows(name: str, *shape: int) -> Array:
-            parts = [getattr(t, name) for t in unique]
+        def rows(name: str, *shape: int, missing: float = 0.0) -> Array:
+            parts = []
+            for t in unique:
+                part = np.asarray(getattr(t, name), float)
+                parts.append(part if len(part) == len(t) else np.full((len(t), *shape), missing))
             return np.concatenate([*parts, np.zeros((0, *shape))]).astype(float)
 
+        free = [t.free for t in unique]
+        looked = len(free) > 0 and all(len(f) in (0, SECTORS) for f in free) and any(map(len, free))
+        nothing = np.zeros(SECTORS, np.uint32)
         return Detections(
-            np.array([t.stamp_ns for t in unique], np.int64),
-            np.repeat(np.arange(len(unique)), [len(t) for t in unique]),
-            rows("p", 3),
-            rows("cov", 3, 3),
-            rows("axis", 3),
-            rows("height"),
-            rows("diameter"),
-            rows("score"),
-        )
+            stamps_ns=np.array([t.stamp_ns for t in unique], np.int64),
+            scan=np.repeat(np.arange(len(unique)), count),
+            p=rows("p", 3),
+            cov=rows("cov", 3, 3),
+            axis=rows("axis", 3),
+            height=rows("height"),
+            diameter=rows("diameter"),
+            score=rows("score"),
+            kinds=rows("kinds", 3, missing=np.nan),
+            measured=rows("measured", 6),
+            stems=rows("stems", missing=1.0).astype(np.int64),
+            source=np.arange(sum(count)),
+            free=np.array([f if len(f) else nothing for f in free], np.uint32) if looked else np.zeros((0, SECTORS), np.uint32),
+            eye=np.array([t.eye for t in unique]).reshape(-1, 3),
+        )  # fmt: skip
+
+    def select(self, keep: NDArray[np.bool_]) -> Detections:
+        """The detections where `keep` (N,); all scans stay."""
+        per_row = ("scan", "p", "cov", "axis", "height", "diameter", "score", "kinds", "measured", "stems", "source")
+        return replace(self, **{k: getattr(self, k)[keep] for k in per_row})
+
+
+def in_order(trunks: Sequence[Trunks]) -> list[Trunks]:
+    """Scans in time order, each stamp once: the order that `Detections.source` counts in."""
+    ordered = sorted(trunks, key=lambda t: t.stamp_ns)
+    return [t for i, t in enumerate(ordered) if i == 0 or t.stamp_ns > ordered[i - 1].stamp_ns]

@@ -1,50 +1,85 @@
-"""Is it a tree? Decided by evidence over scans: sightings, scores, and the scans that should have shown it."""
+"""Does it stand there, and what is it? Decided by evidence over scans: sightings, beams that went through, kinds."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from topograph.geometry import Array, inverse, transform
-from topograph.trees.detections import Detections
+from topograph.trees.detections import SECTORS, Detections
 from topograph.trees.tracks import TreesConfig
+
+TREE, POST, OTHER = range(3)
+KIND_PRIOR = np.log(np.array([0.45, 0.1, 0.45]))
+"""Shares of the kinds that the score was trained with."""
+FRESH = 0.25
+"""Share of what a further sighting of the same tree says that the ones before have not said."""
+MOST = 6.0
+"""Sightings that count at most: looks from all sides still share the tree."""
+SLIPS = 2.0
+"""Scans that may have seen through a tree by mistake: a mixed pixel, a pose that is off for a moment."""
+REACH = 31.0
+"""Beyond this no scan records what it saw through, m."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Existence:
+    """Of T trees.
+
+    Attributes:
+        ok: (T,) it exists as a landmark; `kind` (T,) TREE, POST or OTHER; `probability` (T,) of that kind, NaN unknown.
+        score: (T,) mean log-odds of tree; `hits` (T,) sightings; `passed` (T,) scans that saw through its place.
+    """
+
+    ok: NDArray[np.bool_]
+    kind: NDArray[np.int64]
+    probability: Array
+    score: Array
+    hits: NDArray[np.int64]
+    passed: NDArray[np.int64]
+
+    def select(self, rows: NDArray[np.int64]) -> Existence:
+        """The given rows."""
+        return Existence(
+            **{k: getattr(self, k)[rows] for k in ("ok", "kind", "probability", "score", "hits", "passed")}
+        )
 
 
 def exists(
     detections: Detections, tree: NDArray[np.int64], map_T_scan: Array, places: Array, config: TreesConfig
-) -> tuple[NDArray[np.bool_], Array, NDArray[np.int64], NDArray[np.int64]]:
-    """Which of the trees at `places` (T, 3) exist; mean score (T,), sightings (T,) and expected sightings (T,).
+) -> Existence:
+    """Which of the trees at `places` (T, 3) exist, and what they are.
 
-    The chance of detection by range and bearing is learned from the run itself: the field of view and reach of the
-    sensor need not be configured. A scan counts as expected where that chance is high and no nearer tree is in
-    the way.
+    A scan that saw a trunk speaks for it, a scan whose beams went on through its place at trunk height against it;
+    a scan whose view was blocked says nothing. Without a record of passage (recorded detections) the scans that should
+    have shown a tree and did not take that part; the chance of detection by range and bearing is learned from the run.
     """
-    n = len(places)
+    d, n = detections, len(places)
     used = tree >= 0
     hits = np.bincount(tree[used], minlength=n)
-    score = np.bincount(tree[used], detections.score[used], minlength=n) / np.maximum(hits, 1)
-    seen = np.zeros((len(detections.stamps_ns), n), bool)
-    seen[detections.scan[used], tree[used]] = True
-    p = transform(inverse(map_T_scan)[:, None], places[None])  # (S, T, 3)
-    far = np.hypot(p[..., 0], p[..., 1])
-    bearing = np.arctan2(p[..., 1], p[..., 0])
-    chance = _chance(far, bearing, seen, hits)
-    expected = (chance > 0.35) & ~_hidden(far, bearing)
-    shown = np.sum(expected, axis=0)
-    found = np.sum(expected & seen, axis=0)
+    score = np.bincount(tree[used], d.score[used], minlength=n) / np.maximum(hits, 1)
+    scan, which = _pairs(d, map_T_scan, places)
+    seen = np.isin(scan * n + which, d.scan[used] * n + tree[used])
+    p = transform(inverse(map_T_scan)[scan], places[which]) if len(scan) else np.zeros((0, 3))
+    passed = np.zeros(n, np.int64)
     # A few false detections may fall on one spot; a tree of the run's own kind is seen far more often.
     typical = float(np.median(hits[hits >= config.min_sightings])) if (hits >= config.min_sightings).any() else 0.0
-    enough = hits >= max(config.min_sightings, config.min_share * typical)
-    ratio = found / np.maximum(shown, 1)
-    scored = bool(np.any(detections.score != 0.0))  # recorded detections may come without
-    # Scores differ between sensors and orchards: what counts is also how this run's own trees score.
-    usual = _usual(score[enough], hits[enough])
-    ok = (
-        enough
-        & ((score >= min(config.min_score, config.usual_score * usual)) | (not scored))
-        & ((ratio >= config.min_ratio) | (shown < 4))
-    )
-    return ok, score, hits, shown
+    ok = hits >= max(config.min_sightings, config.min_share * typical)
+    if len(d.free):
+        through = _through(d, scan, p) & ~seen
+        passed = np.bincount(which[through], minlength=n)
+        ok &= passed <= config.passed * hits + SLIPS
+    else:
+        ok &= _shown_often(scan, which, p, seen, hits, n, config)
+    kind, probability = _kinds(d, tree, n)
+    if np.isfinite(probability).any():
+        # Scores differ between sensors and orchards: what counts is also how this run's own trees score.
+        surely = ok & (kind == TREE)
+        ok &= (kind != TREE) | (score >= config.usual_score * _usual(score[surely], hits[surely]))
+    return Existence(ok=ok & (kind != OTHER), kind=kind, probability=probability, score=score, hits=hits, passed=passed)
 
 
 def _usual(score: Array, hits: NDArray[np.int64]) -> float:
@@ -56,26 +91,79 @@ def _usual(score: Array, hits: NDArray[np.int64]) -> float:
     return float(score[order[np.searchsorted(total, 0.5 * total[-1])]])
 
 
-def _chance(far: Array, bearing: Array, seen: NDArray[np.bool_], hits: NDArray[np.int64]) -> Array:
-    """Share of scans that show a well-seen tree, by 5 m of range and 20° of bearing."""
-    sure = hits >= max(8.0, float(np.median(hits)) if len(hits) else 0.0)
-    i = np.minimum((far / 5.0).astype(int), 19)
-    j = ((bearing + np.pi) / (2 * np.pi) * 18).astype(int) % 18
-    cell = i * 18 + j
-    total = np.bincount(cell[:, sure].ravel(), minlength=360)
-    shown = np.bincount(cell[:, sure].ravel(), seen[:, sure].ravel().astype(float), minlength=360)
-    return np.asarray(((shown + 0.1) / (total + 1.0))[cell])
+def _pairs(d: Detections, map_T_scan: Array, places: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Scans and trees that are near each other, (P,) each: memory grows with the recording, not with the map."""
+    if not len(places) or not len(d.stamps_ns):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    reach = REACH if len(d.free) else max(float(np.max(np.linalg.norm(d.p[:, :2], axis=1), initial=0.0)), 1.0)
+    near = cKDTree(places[:, :2]).query_ball_point(map_T_scan[:, :2, 3], reach)
+    rows = [np.asarray(k, np.int64) for k in near]
+    return np.repeat(np.arange(len(rows)), [len(k) for k in rows]), np.concatenate(rows)
 
 
-def _hidden(far: Array, bearing: Array) -> NDArray[np.bool_]:
-    """(S, T): a nearer tree stands within 0.25 m of the line of sight."""
-    hidden = np.zeros(far.shape, bool)
-    for s in range(len(far)):
-        order = np.argsort(far[s])
-        b, r = bearing[s, order], far[s, order]
-        near = r < 60.0
-        b, r = b[near], r[near]
+def _through(d: Detections, scan: NDArray[np.int64], p: Array) -> NDArray[np.bool_]:
+    """Pairs (P,) whose tree at `p` (P, 3) in the scan's base frame was seen through, on both sides of its middle."""
+    away = p - d.eye[scan]
+    far = np.hypot(away[:, 0], away[:, 1])
+    cell = np.minimum(far.astype(np.int64), 31).astype(np.uint32)
+    bearing = (np.arctan2(away[:, 1], away[:, 0]) + np.pi) * (SECTORS / (2 * np.pi))
+    out = far < REACH
+    for shift in (-0.5, 0.0, 0.5):
+        word = d.free[scan, np.floor(bearing + shift).astype(np.int64) % SECTORS]
+        out &= ((word >> cell) & 1).astype(bool)
+    return np.asarray(out)
+
+
+def _kinds(d: Detections, tree: NDArray[np.int64], n: int) -> tuple[NDArray[np.int64], Array]:
+    """Most likely kind (n,) and its probability (n,); trees where the source tells no kinds.
+
+    Sightings of one thing are alike; a further one tells only so much more. What was seen with many returns weighs more.
+    """
+    told = (tree >= 0) & np.isfinite(d.kinds).all(axis=1)
+    if not told.any():
+        return np.full(n, TREE), np.full(n, np.nan)
+    t = tree[told]
+    weight = 1.0 / (1.0 + (np.linalg.norm(d.p[told, :2], axis=1) / 12.0) ** 2)
+    total = np.bincount(t, weight, n)
+    ratio = d.kinds[told] - KIND_PRIOR
+    mean = (
+        np.stack([np.bincount(t, weight * ratio[:, k], n) for k in range(3)], axis=1) / np.maximum(total, 1e-9)[:, None]
+    )
+    effective = np.minimum(1.0 + FRESH * (np.bincount(t, minlength=n) - 1.0), MOST)
+    z = KIND_PRIOR + effective[:, None] * mean
+    z -= z.max(axis=1, keepdims=True)
+    chance = np.exp(z) / np.exp(z).sum(axis=1, keepdims=True)
+    kind = chance.argmax(axis=1)
+    kind[total == 0] = TREE
+    probability = chance[np.arange(n), kind]
+    probability[total == 0] = np.nan
+    return kind, probability
+
+
+def _shown_often(
+    scan: NDArray[np.int64], which: NDArray[np.int64], p: Array, seen: NDArray[np.bool_], hits: NDArray[np.int64],
+    n: int, config: TreesConfig,
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Trees (n,) that enough of the scans showed that should have: where the chance is high and nothing stands before."""
+    far, bearing = np.hypot(p[:, 0], p[:, 1]), np.arctan2(p[:, 1], p[:, 0])
+    sure = (hits >= max(8.0, float(np.median(hits)) if len(hits) else 0.0))[which]
+    cell = np.minimum((far / 5.0).astype(int), 19) * 18 + ((bearing + np.pi) / (2 * np.pi) * 18).astype(int) % 18
+    total = np.bincount(cell[sure], minlength=360)
+    shown = np.bincount(cell[sure], seen[sure].astype(float), minlength=360)
+    chance = ((shown + 0.1) / (total + 1.0))[cell]
+    expected = (chance > 0.35) & ~_hidden(scan, far, bearing)
+    asked = np.bincount(which[expected], minlength=n)
+    found = np.bincount(which[expected & seen], minlength=n)
+    return np.asarray((found / np.maximum(asked, 1) >= config.min_ratio) | (asked < 4))
+
+
+def _hidden(scan: NDArray[np.int64], far: Array, bearing: Array) -> NDArray[np.bool_]:
+    """Pairs (P,): a nearer tree stands within 0.25 m of the line of sight."""
+    hidden = np.zeros(len(far), bool)
+    ends = np.flatnonzero(np.diff(scan)) + 1
+    for rows in np.split(np.arange(len(scan)), ends):
+        rows = rows[far[rows] < 60.0]
+        b, r = bearing[rows], far[rows]
         d = np.abs((b[:, None] - b[None] + np.pi) % (2 * np.pi) - np.pi)
-        blocks = (r[None] < r[:, None] - 1.0) & (d * r[None] < 0.25)
-        hidden[s, order[: len(b)]] = blocks.any(axis=1)
+        hidden[rows] = ((r[None] < r[:, None] - 1.0) & (d * r[None] < 0.25)).any(axis=1)
     return hidden

@@ -13,23 +13,27 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from topograph.geometry import Array, fit_rigid_2d, planar
+from topograph.geometry import Array, fit_rigid_2d, planar, transform
 from topograph.motion import MotionConfig
+from topograph.trees.detections import Detections
 from topograph.trees.tracks import TreesConfig
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TrackTable:
     """Tracks as loop closing sees them; all (T,) unless stated.
 
     Attributes:
-        place: (T, 2) mean position in the current map estimate, m.
+        place: (T, 2) mean position in the current map estimate, m; `foot` (T, 2) where its axis meets the ground.
+        width: diameter, m, 0 unknown.
         sigma: of `place`, m.
         first, last: distance driven at the first and last sighting, m.
         hits: sightings.
     """
 
     place: Array
+    foot: Array
+    width: Array
     sigma: Array
     first: Array
     last: Array
@@ -260,14 +264,28 @@ def _one_to_one(distance: Array, j: NDArray[np.intp]) -> list[tuple[int, int]]:
     return [(i, k) for k, i in taken.items()]
 
 
-def tabulate(detection_xy: Array, variance: Array, track: NDArray[np.int64], distance: Array) -> TrackTable:
-    """Table of tracks 0..T-1 from their detections: map positions (N, 2), variances (N,) and distances driven (N,)."""
-    n = int(track.max(initial=-1)) + 1
+def tabulate(detections: Detections, track: NDArray[np.int64], map_T_scan: Array, distance: Array) -> TrackTable:
+    """Table of tracks 0..T-1 from their detections, seen from map_T_scan (S, 4, 4) after `distance` (S,) driven, m."""
+    d, n = detections, int(track.max(initial=-1)) + 1
+    T, driven = map_T_scan[d.scan], distance[d.scan]
+    xy = transform(T, d.p)[:, :2]
+    above = np.where(np.isfinite(d.height), d.height, 0.0) / np.maximum(d.axis[:, 2], 0.3)
+    foot = transform(T, d.p - above[:, None] * d.axis)[:, :2]
     hits = np.bincount(track, minlength=n)
     total = np.maximum(hits, 1)
-    place = np.stack([np.bincount(track, detection_xy[:, k], minlength=n) / total for k in range(2)], axis=1)
+
+    def mean(x: Array) -> Array:
+        return np.asarray(np.bincount(track, x, minlength=n) / total)
+
     first, last = np.full(n, np.inf), np.full(n, -np.inf)
-    np.minimum.at(first, track, distance)
-    np.maximum.at(last, track, distance)
-    sigma = np.sqrt(np.bincount(track, variance, minlength=n) / total / np.sqrt(total))
-    return TrackTable(place, sigma, first, last, hits)
+    np.minimum.at(first, track, driven)
+    np.maximum.at(last, track, driven)
+    return TrackTable(
+        place=np.stack([mean(xy[:, k]) for k in range(2)], axis=1),
+        foot=np.stack([mean(foot[:, k]) for k in range(2)], axis=1),
+        width=mean(np.nan_to_num(d.diameter)),
+        sigma=np.sqrt(mean(0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1])) / np.sqrt(total)),
+        first=first,
+        last=last,
+        hits=hits,
+    )

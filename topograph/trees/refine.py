@@ -7,23 +7,20 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from topograph.geometry import Array
+from topograph.trees.loops import TrackTable
 from topograph.trees.tracks import TreesConfig
 
 
 def refine(
-    place: Array,
-    sigma: Array,
-    hits: NDArray[np.int64],
-    tree: NDArray[np.int64],
-    config: TreesConfig,
-    patience: float = 0.0,
+    tracks: TrackTable, tree: NDArray[np.int64], config: TreesConfig, patience: float = 0.0
 ) -> NDArray[np.int64]:
-    """Tree (T,) of each track, renumbered from 0, given the tracks' places (T, 2), sigmas and hits in the solved map.
+    """Tree (T,) of each track, renumbered from 0, given the tracks as the solved map has them.
 
     A track that does not fit its tree leaves it, when it is also farther than `patience` m from it: a map that has
-    just closed its loops is still bent. Then trees that lie within each other's gate, or nearer than
-    `config.merge`, become one. Rare tracks join a tree when they fit and are trees of their own otherwise.
+    just closed its loops is still bent. Then trees that lie within each other's gate, or whose feet or points are nearer
+    than `config.merge` (a thick trunk's pieces: than its radius), become one. Rare tracks join a tree when they fit and are trees of their own otherwise.
     """
+    place, sigma, hits = tracks.place, tracks.sigma, tracks.hits
     tree = _leave(place, sigma, hits, tree.copy(), config, max(patience, config.merge))
     for _ in range(4):
         ids, index = np.unique(tree, return_inverse=True)
@@ -31,19 +28,24 @@ def refine(
         total = np.bincount(index, w)
         centre = np.stack([np.bincount(index, w * place[:, k]) / total for k in range(2)], axis=1)
         spread = np.bincount(index, w * sigma) / total
+        foot = np.stack([np.bincount(index, w * tracks.foot[:, k]) / total for k in range(2)], axis=1)
+        width = np.bincount(index, w * tracks.width) / total
         pairs = cKDTree(centre).query_pairs(max(3.0 * config.merge, 1.0), output_type="ndarray")
-        d = np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1)
-        variance = spread[pairs[:, 0]] ** 2 + spread[pairs[:, 1]] ** 2 + 2 * config.floor**2
-        fits = (d < config.merge) | (d**2 < 0.5 * config.gate * variance)
+        a, b = pairs.T
+        d = np.minimum(np.linalg.norm(centre[a] - centre[b], axis=1), np.linalg.norm(foot[a] - foot[b], axis=1))
+        variance = spread[a] ** 2 + spread[b] ** 2 + 2 * config.floor**2
+        fits = (d < config.merge + 0.4 * np.maximum(np.maximum(width[a], width[b]) - 0.2, 0.0)) | (
+            d**2 < 0.5 * config.gate * variance
+        )
         if not fits.any():
             break
         name = np.arange(len(ids))
         joined: set[int] = set()
         for k in np.argsort(d):
-            a, b = pairs[k].tolist()
-            if fits[k] and a not in joined and b not in joined:  # one merge a round: centres move
-                name[b] = a
-                joined |= {a, b}
+            i, j = pairs[k].tolist()
+            if fits[k] and i not in joined and j not in joined:  # one merge a round: centres move
+                name[j] = i
+                joined |= {i, j}
         tree = ids[name[index]]
     return np.asarray(np.unique(tree, return_inverse=True)[1])
 

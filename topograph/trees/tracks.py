@@ -27,8 +27,9 @@ class TreesConfig:
         mapped: chance that a trunk seen on old ground is already in the map.
         margin: log-odds by which a loop must beat its rivals and the absence of a loop.
         merge: two trees nearer than this are one (stems of one tree), m.
-        min_sightings, min_score, min_ratio: of a tree that exists; ratio of sightings to scans that should show it;
-        usual_score: share of the run's median score that is enough;
+        min_sightings, min_ratio: of a tree that exists; ratio of sightings to scans that should show it (recorded detections);
+        passed: scans that saw through its place, for each that saw it, that a tree survives;
+        usual_score: share of the run's median score of trees that is enough;
         min_share: of the sightings that trees of the same run have at the median.
     """
 
@@ -40,11 +41,11 @@ class TreesConfig:
     recent: float = 25.0
     mapped: float = 0.6
     margin: float = 7.0
-    merge: float = 0.7
+    merge: float = 0.5
     min_sightings: int = 6
-    min_score: float = 2.3
-    usual_score: float = 0.45
     min_ratio: float = 0.15
+    passed: float = 0.1
+    usual_score: float = 0.25
     min_share: float = 0.03
 
 

@@ -2,6 +2,7 @@
 
 from topograph.trunks.config import TrunksConfig
 from topograph.trunks.recorded import from_recorded
+from topograph.trunks.smear import smeared
 from topograph.trunks.thesis import ThesisTrunksConfig
 
-__all__ = ["ThesisTrunksConfig", "TrunksConfig", "from_recorded"]
+__all__ = ["ThesisTrunksConfig", "TrunksConfig", "from_recorded", "smeared"]

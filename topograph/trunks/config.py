@@ -17,7 +17,7 @@ class TrunksConfig:
         reference: height above ground at which the axis is stated.
         widest, thinnest: diameters of a trunk.
         prior_diameter, prior_sigma: of trunks too coarsely seen to measure.
-        min_score: log-odds below which a candidate is dropped.
+        min_score: log-odds (tree or post) below which a candidate is dropped; what a scan doubts, many scans decide.
         recorded_sigma, recorded_growth, recorded_along: first guess of the noise of recorded detections: at the
             sensor, per metre of range, and along the axis (where on the trunk a detection lies is not stated, and
             in recordings it moves with the sensor's height: next to no information).
@@ -31,10 +31,10 @@ class TrunksConfig:
     high: float = 1.7
     reference: float = 0.8
     thinnest: float = 0.05
-    widest: float = 0.8
+    widest: float = 1.3
     prior_diameter: float = 0.25
     prior_sigma: float = 0.09
-    min_score: float = 0.0
+    min_score: float = -2.0
     recorded_sigma: float = 0.05
     recorded_growth: float = 0.01
     recorded_along: float = 5.0

@@ -11,23 +11,29 @@ from numpy.typing import NDArray
 
 from topograph.bags import Scan, Trunks
 from topograph.geometry import Array
+from topograph.trunks import fit as fitting
 from topograph.trunks import score as scoring
 from topograph.trunks.config import TrunksConfig
-from topograph.trunks.fit import FEATURES, OUT_SIZE, covariances, fit_chains, gather, merge_stems, suppress
+from topograph.trunks.features import FEATURES, describe
+from topograph.trunks.fit import OUT_SIZE, covariances, fit_chains, gather, members, merge_stems, suppress, vertical
 from topograph.trunks.ground import fit_ground
-from topograph.trunks.organise import angular_step, organise, rings_of
-from topograph.trunks.runs import RUN_SIZE, find_runs, heights, link
+from topograph.trunks.organise import angular_step, once, organise, rings_of
+from topograph.trunks.passage import passage, ring_image
+from topograph.trunks.runs import FIRST, LAST, RUN_SIZE, find_runs, heights, link
 
 _NO_TIME = np.zeros(0, np.float32)
+STEM_DISTANCE = 0.45
+"""Two trunks whose axes come that near are stems or pieces of one tree, m."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Candidates:
     """What could be trunks, before the score decides.
 
     Attributes:
-        fits: (C, OUT_SIZE), see fit.py; `features` (C, F); `name` (C,) chain of each.
+        fits: (C, OUT_SIZE), see fit.py; `features` (C, F); `name` (C,) first run of each one's chain.
         points: (M, 3) of the sweep in `base_link`; `runs`, `label`, `chain`: how they hang together, see runs.py.
+        free: (SECTORS,) what was seen through, see passage.py.
     """
 
     fits: Array
@@ -37,25 +43,37 @@ class Candidates:
     runs: Array
     label: NDArray[np.int32]
     chain: NDArray[np.int64]
+    free: NDArray[np.uint32]
 
 
 _NOTHING = Candidates(
-    np.zeros((0, OUT_SIZE)), np.zeros((0, len(FEATURES))), np.zeros(0, np.int64), np.zeros((0, 3), np.float32),
-    np.zeros((0, RUN_SIZE)), np.zeros(0, np.int32), np.zeros(0, np.int64),
-)  # fmt: skip
+    fits=np.zeros((0, OUT_SIZE)),
+    features=np.zeros((0, len(FEATURES))),
+    name=np.zeros(0, np.int64),
+    points=np.zeros((0, 3), np.float32),
+    runs=np.zeros((0, RUN_SIZE)),
+    label=np.zeros(0, np.int32),
+    chain=np.zeros(0, np.int64),
+    free=np.zeros(0, np.uint32),
+)
 
 
-def candidates(scan: Scan, base_T_lidar: Array, twist: Array, config: TrunksConfig) -> Candidates:
+def candidates(
+    scan: Scan, base_T_lidar: Array, twist: Array, config: TrunksConfig, up: Array | None = None
+) -> Candidates:
     """Everything in a sweep that stands up and is as thin as a trunk. A pure function.
 
-    `twist` (6,) is the base's linear (m/s) and angular (rad/s) velocity during the sweep.
+    `twist` (6,) is the base's linear (m/s) and angular (rad/s) velocity during the sweep; `up` (2,) the vertical in
+    the base's frame, horizontal metres per metre of height, where it is known: else the trunks tell.
     """
+    scan = once(scan)
     if len(scan.xyz) == 0:
         return _NOTHING
-    ring, n_rings = rings_of(scan)
+    R = base_T_lidar[:3, :3]
+    ring, tangent = rings_of(scan, bool(R[2, 2] < 0))
     offset = _NO_TIME if scan.offset is None else scan.offset
-    p, r, starts, top, low = organise(
-        scan.xyz, ring, offset, base_T_lidar, twist, n_rings, config.nearest, config.farthest + 8.0
+    p, r, starts, low = organise(
+        scan.xyz, ring, offset, base_T_lidar, twist, len(tangent), config.nearest, config.farthest + 8.0
     )
     if len(p) < 50:
         return _NOTHING
@@ -65,12 +83,29 @@ def candidates(scan: Scan, base_T_lidar: Array, twist: Array, config: TrunksConf
     h, above, beside = heights(p, plane, grid)
     runs, label = find_runs(p, r, h, starts, eye, step, config.low, config.high, config.widest)
     chain = link(runs)
-    fits, features, name = fit_chains(
-        p, r, h, runs, label, chain, plane, grid, above, beside, eye, step, top, config.reference,
+    near, slope = ring_image(p, r, starts, eye)
+    if up is None:
+        up = vertical(runs, chain, 64)
+    heads, order, ends = members(chain)
+    fits, name = fit_chains(
+        runs, heads, order, ends, plane, grid, eye, step, up, config.reference,
         config.prior_diameter, config.prior_sigma, config.thinnest, config.widest,
     )  # fmt: skip
-    near = fits[:, 13] < config.farthest
-    return Candidates(fits[near], features[near], name[near], p, runs, label, chain)
+    within = fits[:, fitting.FAR] < config.farthest
+    fits, name = fits[within], name[within]
+    features = describe(
+        p, r, runs, label, order, ends, fits, name, near, tangent, np.ascontiguousarray(R), eye, above, beside, up, step
+    )
+    return Candidates(
+        fits=fits,
+        features=features,
+        name=heads[name],
+        points=p,
+        runs=runs,
+        label=label,
+        chain=chain,
+        free=passage(near, slope, eye, plane, grid),
+    )
 
 
 class Detector:
@@ -80,22 +115,34 @@ class Detector:
         self.base_T_lidar = np.ascontiguousarray(base_T_lidar, float)
         self.config = config
 
-    def __call__(self, scan: Scan, twist: Array) -> Trunks:
-        c = candidates(scan, self.base_T_lidar, np.asarray(twist, float), self.config)
+    def __call__(self, scan: Scan, twist: Array, up: Array | None = None) -> Trunks:
+        c = candidates(scan, self.base_T_lidar, np.asarray(twist, float), self.config, up)
         if len(c.fits) == 0:
             return none_at(scan.stamp_ns)
-        log_odds = scoring.score(c.features)
-        keep = log_odds > self.config.min_score
-        fits, odds, name = c.fits[keep], log_odds[keep], c.name[keep]
-        group = suppress(fits, odds, 0.6)
+        kinds = scoring.kinds(c.features)
+        odds = scoring.column_odds(kinds)
+        keep = odds > self.config.min_score
+        fits, kinds, odds, name = c.fits[keep], kinds[keep], odds[keep], c.name[keep]
+        group = suppress(fits, odds, STEM_DISTANCE)
         best, merged = merge_stems(fits, odds, group)
         wanted = np.full(len(c.runs), -1, np.int64)
         wanted[name] = np.searchsorted(best, group)
-        rows, ends = gather(wanted, len(best), c.chain, c.runs, c.label)
-        clouds = tuple(c.points[rows[a:b]] for a, b in pairwise(ends.tolist()))
+        rows, ends = gather(wanted, len(best), c.chain, c.runs, c.label, FIRST, LAST)
         return Trunks(
-            scan.stamp_ns, "base_link", merged[:, :3], merged[:, 3:6], merged[:, 6], covariances(merged, *scoring.calibration()), merged[:, 7],
-            odds[best], clouds,
+            stamp_ns=scan.stamp_ns,
+            frame="base_link",
+            p=merged[:, :3],
+            axis=merged[:, 3:6],
+            diameter=merged[:, fitting.DIAMETER],
+            cov=covariances(merged, scoring.error_scales(c.features[keep][best])),
+            height=merged[:, fitting.ABOVE],
+            score=scoring.tree_odds(kinds[best]),
+            clouds=tuple(c.points[rows[a:b]] for a, b in pairwise(ends.tolist())),
+            kinds=kinds[best],
+            measured=merged[:, [fitting.LEVER, fitting.SLOPE_X, fitting.SLOPE_Y, fitting.SLOPE_WEIGHT, fitting.WIDE, fitting.WIDE_SIGMA]],
+            stems=merged[:, fitting.STEMS].astype(np.int64),
+            free=c.free,
+            eye=self.base_T_lidar[:3, 3],
         )  # fmt: skip
 
 
@@ -113,4 +160,4 @@ def warm_up() -> None:
         [np.stack([5 * np.cos(az), 5 * np.sin(az), np.full(600, -0.8 + 0.2 * k)], 1) for k in range(4)]
     )
     scan = Scan(1, "lidar", xyz.astype(np.float32), np.repeat(np.arange(4), 600).astype(np.int32), None, None)
-    candidates(scan, np.eye(4), np.zeros(6), TrunksConfig())
+    Detector(np.eye(4), TrunksConfig())(scan, np.zeros(6))

@@ -7,24 +7,59 @@ from numba import njit
 from numpy.typing import NDArray
 
 from topograph.bags import Scan
+from topograph.geometry import Array
 
 HALF = 32
 """Ground cells of 1 m in each direction from the base."""
 
 
-def rings_of(scan: Scan) -> tuple[NDArray[np.int32], int]:
-    """Ring (N,) of each point from below upwards, and their number: the field, or clusters of elevation, or bins.
+def rings_of(scan: Scan, flipped: bool = False) -> tuple[NDArray[np.int32], Array]:
+    """Ring (N,) of each point, counted from below upwards, and the tangent (R,) of each ring's elevation in the sensor's
+    frame: lasers by the field, whatever their numbers, or clusters of elevation, or bins. `flipped`: the sensor hangs
+    upside down.
 
     A sensor with fixed lasers shows its elevations as narrow peaks; a cloud without such peaks gets half-degree bins.
     """
-    if scan.ring is not None and len(scan.ring) and scan.ring.min() >= 0 and scan.ring.max() < 256:
-        return scan.ring, int(scan.ring.max()) + 1
     xyz = scan.xyz
+    ring = scan.ring
+    if ring is None or not len(ring) or ring.min() < 0 or ring.max() >= 512:
+        ring = _clusters(xyz)
+    count = np.bincount(ring)
+    total, n = _rise(xyz, ring, len(count), slice(None, None, SAMPLE))
+    if (n[count > 0] < 3).any():
+        total, n = _rise(xyz, ring, len(count), slice(None))
+    tangent = total / np.maximum(n, 1)
+    tangent[n == 0] = np.inf  # nothing was returned: no place among the others
+    order = np.argsort(-tangent if flipped else tangent, kind="stable")
+    rank = np.empty(len(count), np.int32)
+    rank[order] = np.arange(len(count))
+    full = int((n > 0).sum())
+    if flipped:  # rings without returns came first
+        order, rank = order[len(count) - full :], rank - (len(count) - full)
+    out = ring if np.array_equal(rank, np.arange(len(count))) else rank[ring]
+    return out.astype(np.int32, copy=False), tangent[order[:full]]
+
+
+SAMPLE = 7
+"""Every so-manieth point tells a ring's elevation; no divisor of the usual numbers of lasers, which fire in turn."""
+
+
+def _rise(xyz: NDArray[np.float32], ring: NDArray[np.int32], n: int, some: slice) -> tuple[Array, NDArray[np.int64]]:
+    """Sum of tangents of elevation and their number, (n,), by ring."""
+    x, y, z, k = xyz[some, 0], xyz[some, 1], xyz[some, 2], ring[some]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        t = z / np.sqrt(x * x + y * y)
+    ok = np.isfinite(t)
+    return np.asarray(np.bincount(k[ok], t[ok], n), float), np.bincount(k[ok], minlength=n).astype(np.int64)
+
+
+def _clusters(xyz: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Ring (N,) of points without a ring field."""
     with np.errstate(invalid="ignore"):
         elevation = np.degrees(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
     finite = np.isfinite(elevation)
     if not finite.any():
-        return np.zeros(len(xyz), np.int32), 1
+        return np.zeros(len(xyz), np.int32)
     count, edges = np.histogram(elevation[finite], np.arange(-91.0, 91.0, 0.05))
     full = np.flatnonzero(count > max(3, 0.0005 * finite.sum()))
     groups = np.split(full, np.flatnonzero(np.diff(full) > 2) + 1)
@@ -34,9 +69,21 @@ def rings_of(scan: Scan) -> tuple[NDArray[np.int32], int]:
         middle = np.array([0.5 * (edges[g[0]] + edges[g[-1] + 1]) for g in groups])
         split = 0.5 * (middle[1:] + middle[:-1])
     else:
-        split = np.arange(-30.0, 30.0, 0.5)
-    ring = np.searchsorted(split, np.where(finite, elevation, 0.0)).astype(np.int32)
-    return ring, len(split) + 1
+        split = np.arange(-60.0, 60.0, 0.5)
+    return np.searchsorted(split, np.where(finite, elevation, 0.0)).astype(np.int32)
+
+
+def once(scan: Scan) -> Scan:
+    """The scan without its second half where that repeats the first."""
+    half = len(scan.xyz) // 2
+    if half == 0 or len(scan.xyz) % 2 or not np.array_equal(scan.xyz[:2], scan.xyz[half : half + 2]):
+        return scan
+    if not np.array_equal(scan.xyz[:half], scan.xyz[half:], equal_nan=True):
+        return scan
+    ring = None if scan.ring is None else scan.ring[:half]
+    offset = None if scan.offset is None else scan.offset[:half]
+    intensity = None if scan.intensity is None else scan.intensity[:half]
+    return Scan(scan.stamp_ns, scan.frame, scan.xyz[:half], ring, offset, intensity)
 
 
 FAST = {"contract", "reassoc", "arcp", "nsz"}
@@ -45,8 +92,8 @@ FAST = {"contract", "reassoc", "arcp", "nsz"}
 
 @njit(cache=True, fastmath=FAST)
 def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
-    """Points in ring order: base-frame xyz (M, 3), horizontal range from the sensor (M,), ring starts (R+1,), the tangent
-    of the highest ring's elevation, and the lowest point (2 HALF, 2 HALF) of each ground cell.
+    """Points in ring order: base-frame xyz (M, 3), horizontal range from the sensor (M,), ring starts (R+1,), and the
+    lowest point (2 HALF, 2 HALF) of each ground cell. A point that repeats the one before it in its ring is dropped.
 
     `offset` (N,) s or empty; `twist` (6,) of the base. First the motion during the sweep is taken out, to second
     order in the sweep's time; then the points are where they were at the stamp, seen from the base then.
@@ -65,10 +112,15 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
         x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
         d2 = x * x + y * y + z * z
         inside[i] = (d2 > near2) & (d2 < far2)  # NaN compares false
+    before = np.zeros((n_rings, 3), np.float32)
     for i in range(n):
         k = ring[i]
         inside[i] &= (k >= 0) & (k < n_rings)
         if inside[i]:
+            if before[k, 0] == xyz[i, 0] and before[k, 1] == xyz[i, 1] and before[k, 2] == xyz[i, 2]:
+                inside[i] = False
+                continue
+            before[k, 0], before[k, 1], before[k, 2] = xyz[i, 0], xyz[i, 1], xyz[i, 2]
             count[k + 1] += 1
     for k in range(n_rings):
         count[k + 1] += count[k]
@@ -77,8 +129,9 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
     p = np.empty((m, 3), np.float32)
     r = np.empty(m, np.float32)
     fill = count[:-1].copy()
-    before = np.zeros((n_rings, 2), np.float32)
+    before[:] = 0.0
     turns = np.zeros((n_rings, 2), np.int64)
+    rounds = np.zeros(n_rings, np.int64)
     low = np.full((2 * HALF, 2 * HALF), 1e9, np.float32)
     for i in range(n):
         if not inside[i]:
@@ -91,6 +144,7 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
         side = before[g, 0] * y - before[g, 1] * x
         turns[g, 0] += side > 0
         turns[g, 1] += side < 0
+        rounds[g] += (x < 0) & ((y < 0) != (before[g, 1] < 0))
         before[g, 0], before[g, 1] = x, y
         bx = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + tx
         by = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + ty
@@ -113,20 +167,13 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
         lo, hi = starts[k], starts[k + 1]
         if hi - lo < 3:
             continue
-        # Firing order is azimuth order but for the place where the turn closes; anything else is sorted.
-        if min(turns[k, 0], turns[k, 1]) > 2 + (hi - lo) // 200:
+        # Firing order is azimuth order but for the place where the turn closes; anything else is sorted. A ring that
+        # comes round more than twice is several in one.
+        if min(turns[k, 0], turns[k, 1]) > 2 + (hi - lo) // 200 or rounds[k] > 3:
             order = np.argsort(np.arctan2(p[lo:hi, 1] - ty, p[lo:hi, 0] - tx))
             p[lo:hi] = p[lo:hi][order]
             r[lo:hi] = r[lo:hi][order]
-    top = 0.26
-    for k in range(n_rings - 1, -1, -1):
-        if starts[k + 1] - starts[k] > 20:
-            rise = 0.0
-            for i in range(starts[k], starts[k + 1]):
-                rise += (p[i, 2] - tz) / max(r[i], np.float32(0.1))
-            top = rise / (starts[k + 1] - starts[k])
-            break
-    return p, r, starts, top, low
+    return p, r, starts, low
 
 
 @njit(cache=True)

@@ -10,6 +10,9 @@ from topograph.bags import Trunks
 from topograph.geometry import Array, transform
 from topograph.trunks.config import TrunksConfig
 
+LOWEST, HIGHEST = 0.05, 3.0
+"""Heights above `base_link` that are taken for heights above ground, m; a detection at 0 does not say how high it is."""
+
 
 def from_recorded(trunks: Trunks, base_T_sensor: Array, config: TrunksConfig) -> Trunks:
     """Trunks in `base_link`.
@@ -30,23 +33,12 @@ def from_recorded(trunks: Trunks, base_T_sensor: Array, config: TrunksConfig) ->
     sigma = config.recorded_sigma + config.recorded_growth * distance
     cov = sigma[:, None, None] ** 2 * np.eye(3)
     cov = cov + config.recorded_along**2 * axis[:, :, None] * axis[:, None, :]
+    # The frame stands on the ground (REP-105), and the ground under a tree is about as steep as under the robot.
+    above = np.where((p[:, 2] > LOWEST) & (p[:, 2] < HIGHEST), p[:, 2], np.nan)
+    height = np.where(np.isfinite(trunks.height), trunks.height, above)
     near = (distance > config.nearest) & (distance < config.recorded_reach)
-    out = replace(trunks, frame="base_link", p=p, axis=axis, cov=cov, diameter=diameter, surface=False)
-    return out if near.all() else select(out, near)
-
-
-def select(trunks: Trunks, keep: np.typing.NDArray[np.bool_]) -> Trunks:
-    """The rows of `trunks` where `keep` (N,)."""
-    return replace(
-        trunks,
-        p=trunks.p[keep],
-        axis=trunks.axis[keep],
-        diameter=trunks.diameter[keep],
-        cov=trunks.cov[keep],
-        height=trunks.height[keep],
-        score=trunks.score[keep],
-        clouds=tuple(c for c, k in zip(trunks.clouds, keep, strict=True) if k) if trunks.clouds else (),
-    )
+    out = replace(trunks, frame="base_link", p=p, axis=axis, cov=cov, diameter=diameter, height=height, surface=False)
+    return out if near.all() else out.select(near)
 
 
 def _width(cloud: np.typing.NDArray[np.float32], centre: Array) -> float:

@@ -49,10 +49,7 @@ def heights(p, plane, grid):
 
 @njit(cache=True)
 def look_around(cells, x, y, first, second, third, out):
-    """Points within `first` m, from there to `second` and to `third` m, and the octants covered in the outer two: (5,) `out`.
-
-    A canopy is all around its trunk; what stands on one side only is another thing's.
-    """
+    """Points within `first` m, from there to `second` and to `third` m, and the octants covered in the outer two: (5,) `out`."""
     i, j = int(4.0 * (x + HALF)), int(4.0 * (y + HALF))
     out[:] = 0.0
     inner, outer = 0, 0
@@ -157,9 +154,9 @@ def link(runs):
             dx, dy = runs[j, PX] - runs[i, PX], runs[j, PY] - runs[i, PY]
             d = np.sqrt(dx * dx + dy * dy)
             dz = abs(runs[j, PZ] - runs[i, PZ])
-            if d > 0.12 + 0.35 * dz + 0.004 * runs[i, RANGE]:
-                continue
             wide, thin = max(runs[i, WIDTH], runs[j, WIDTH]), min(runs[i, WIDTH], runs[j, WIDTH])
+            if d > 0.12 + 0.35 * dz + 0.004 * runs[i, RANGE] + 0.12 * max(wide - 0.3, 0.0):
+                continue
             c = d + 0.15 * rings + 0.1 * (wide - thin)
             if c < cost:
                 best, cost = j, c

@@ -1,49 +1,107 @@
-"""Tree or not: a small network on the features of a candidate; its weights come from `tools/train_score.py`."""
+"""Tree, post or something else: a small network on the features of a candidate; its weights come from `tools/train_score.py`."""
 
 from __future__ import annotations
 
 import functools
 import json
+from dataclasses import dataclass
 from importlib import resources
 
 import numpy as np
 from numpy.typing import NDArray
 
 from topograph.geometry import Array
-from topograph.trunks.fit import FEATURES
+from topograph.trunks.features import FEATURES
+
+KINDS = ("tree", "post", "other")
+"""What a candidate can be, in the order of the columns of log-probabilities."""
+TREE, POST, OTHER = range(3)
+CLIP = 4.0
+"""Features further than this from the training's mean, in its deviations, tell no more than that they are far."""
+TEMPER = 0.5
+"""Share of the log-odds that is left to a candidate outside of what was trained on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """The trained score.
+
+    Attributes:
+        mean, deviation: (F,) of the features in training; `low`, `high` (F,) their range there.
+        layers: weights and offsets of each layer in turn.
+    """
+
+    mean: Array
+    deviation: Array
+    low: Array
+    high: Array
+    layers: list[NDArray[np.float32]]
 
 
 @functools.lru_cache(maxsize=1)
-def weights() -> tuple[Array, Array, list[NDArray[np.float32]]]:
-    """Mean and deviation of the features, then weights and offsets of each layer in turn.
+def _file() -> dict[str, object]:
+    data: dict[str, object] = json.loads(resources.files("topograph.trunks").joinpath("score.json").read_text())
+    return data
+
+
+@functools.lru_cache(maxsize=1)
+def network() -> Network:
+    """The shipped weights.
 
     Raises:
         ValueError: the file was trained for other features.
     """
-    text = resources.files("topograph.trunks").joinpath("score.json").read_text()
-    data = json.loads(text)
-    if tuple(data["features"]) != FEATURES:
+    data = _file()
+    if tuple(data["features"]) != FEATURES:  # type: ignore[arg-type]  # json knows no tuples
         raise ValueError("trunks/score.json was trained for other features: run tools/train_score.py")
-    layers = [np.array(v, np.float32) for v in data["layers"]]
-    return np.array(data["mean"]), np.array(data["deviation"]), layers
+    row = {k: np.array(data[k], float) for k in ("mean", "deviation", "low", "high")}
+    return Network(layers=[np.array(v, np.float32) for v in data["layers"]], **row)  # type: ignore[attr-defined]  # json's object
 
 
-def score(features: Array) -> Array:
-    """Log-odds (C,) that candidates with `features` (C, len(FEATURES)) are trees."""
-    mean, deviation, layers = weights()
-    x = (features - mean) / deviation
-    return forward(np.minimum(np.maximum(x, -4.0), 4.0).astype(np.float32), layers)
+def kinds(features: Array) -> Array:
+    """Log-probabilities (C, 3) of KINDS of candidates with `features` (C, len(FEATURES))."""
+    n = network()
+    x = np.clip((features - n.mean) / n.deviation, -CLIP, CLIP).astype(np.float32)
+    z = forward(x, n.layers)
+    # Outside of what was trained on nobody knows: the answer is drawn towards "undecided", and many sightings decide.
+    far = ((features < n.low) | (features > n.high)).any(axis=1)
+    z[far] *= TEMPER
+    top = z.max(axis=1, keepdims=True)
+    return np.asarray(z - top - np.log(np.exp(z - top).sum(axis=1, keepdims=True)))
 
 
 def forward(x: NDArray[np.float32], layers: list[NDArray[np.float32]]) -> Array:
     """The network: layers of tanh, the last one linear."""
     for k in range(0, len(layers) - 2, 2):
         x = np.tanh(x @ layers[k] + layers[k + 1])
-    return np.asarray(x @ layers[-2] + layers[-1], float)[:, 0]
+    return np.asarray(x @ layers[-2] + layers[-1], float)
+
+
+def tree_odds(log_p: Array) -> Array:
+    """Log-odds (C,) of tree against all else."""
+    return np.asarray(log_p[:, TREE] - np.logaddexp(log_p[:, POST], log_p[:, OTHER]))
+
+
+def column_odds(log_p: Array) -> Array:
+    """Log-odds (C,) of tree or post, things that stand still and mark a place, against all else."""
+    return np.asarray(np.logaddexp(log_p[:, TREE], log_p[:, POST]) - log_p[:, OTHER])
+
+
+ERRORS = ("range", "points", "width_spread", "line_rms", "rough", "free", "undergrowth", "close_by")
+"""Features that say how far a fit is to be trusted: what is half hidden, or not one column, is farther off."""
 
 
 @functools.lru_cache(maxsize=1)
-def calibration() -> tuple[Array, Array]:
-    """Factors (4,) on radial and tangential deviations by range class (0-5, 5-10, 10-20, 20+ m)."""
-    data = json.loads(resources.files("topograph.trunks").joinpath("score.json").read_text())
-    return np.array(data["radial_factor"], float), np.array(data["tangential_factor"], float)
+def _error_model() -> tuple[NDArray[np.int64], Array]:
+    data = _file()
+    return np.array([FEATURES.index(k) for k in ERRORS]), np.array(data["error_scale"], float)
+
+
+def error_scales(features: Array) -> Array:
+    """Factors (C, 2) on the radial and tangential deviations of fits with `features`, learned from their errors: a
+    log-linear model of the deviation.
+    """
+    columns, weights = _error_model()
+    n = network()
+    x = np.clip((features[:, columns] - n.mean[columns]) / n.deviation[columns], -CLIP, CLIP)
+    return np.asarray(np.exp(np.clip(x @ weights[:, 1:].T + weights[:, 0], -1.0, 2.5)))

@@ -66,7 +66,7 @@ class ThesisDetector:
         self.base_T_lidar = base_T_lidar
         self.config = config
 
-    def __call__(self, scan: Scan, twist: Array) -> Trunks:
+    def __call__(self, scan: Scan, twist: Array, up: Array | None = None) -> Trunks:
         points, normals = self.filtered(scan)
         clusters = self.clusters(points, normals)
         c = self.config

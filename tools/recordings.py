@@ -1,0 +1,260 @@
+"""The recorded data of ../shared/data as trials: real stems under virtual sweeps, and the street.
+
+A library for `tools/evaluate_recorded.py` and `tests/promises/`; nothing here is trained or tuned.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from topograph.bags import Scan, Trunks
+from topograph.config import Config
+from topograph.evaluate.metrics import match
+from topograph.geometry import Array, align_se3, from_xyz_rpy, transform
+from topograph.motion import Motion
+from topograph.pipeline import read_run, solve_run, topo_map
+from topograph.topomap import TopoMap
+from topograph.trees import Detections, exists, follow, refine, screen, shapes, tabulate
+
+DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
+HEIGHT = 1.0
+"""Of the sensor above the ground, m."""
+GATE = 0.5
+"""A trunk is at a stem when it is within this of the stem's listed place, m."""
+SENSORS = {"VLP-16": np.arange(-15.0, 16.0, 2.0), "64 rings": np.linspace(-22.5, 22.5, 64)}
+
+
+def module(name: str) -> ModuleType:
+    """A script of the shared data."""
+    spec = importlib.util.spec_from_file_location(name, DATA / f"{name}.py")
+    if spec is None or spec.loader is None:
+        raise FileNotFoundError(DATA / f"{name}.py")
+    out = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(out)
+    return out
+
+
+@dataclass(frozen=True)
+class Look:
+    """A virtual sweep: the scan, plot_T_base, and which stems it shows with 5 returns at 0.25-1.7 m."""
+
+    scan: Scan
+    plot_T_base: Array
+    visible: Array
+
+
+class Plot:
+    """A recorded cloud of real stems.
+
+    Attributes:
+        stems: (M, 3) listed x, y at 0.8 m and diameter.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.sweeps = module("virtual_sweeps")
+        self.name = name
+        self.points, self.stems = self.sweeps.load(name)
+        with np.load(DATA / "real_stems" / f"{name}.npz", allow_pickle=False) as f:
+            self.made = f["made_ground"] if "made_ground" in f else np.zeros(len(self.points), bool)
+        self.low, self.high = self.stems[:, :2].min(0), self.stems[:, :2].max(0)
+
+    @cached_property
+    def _floor(self) -> tuple[Array | None, cKDTree | None, Array]:
+        if self.made.any():
+            q = self.points[self.made]
+            plane = np.linalg.lstsq(np.c_[q[:, :2], np.ones(len(q))], q[:, 2], rcond=None)[0]
+            return plane, None, np.zeros(0)
+        low = self.points[self.points[:, 2] < 1.5]
+        return None, cKDTree(low[:, :2]), low[:, 2]
+
+    def ground(self, xy: Array) -> float:
+        """Height of the ground at (2,); NaN where nothing is recorded."""
+        plane, tree, z = self._floor
+        if plane is not None:
+            return float(plane @ [xy[0], xy[1], 1.0])
+        assert tree is not None
+        near = tree.query_ball_point(xy, 0.4)
+        return float(np.percentile(z[near], 5)) if len(near) > 3 else np.nan
+
+    @cached_property
+    def axes(self) -> Array:
+        """(M, 2, 2): slope and offset of x and y over height above ground, by circles in slices of the cloud.
+
+        The listed places are a hand's breadth off these at 0.8 m: on them, centimetres cannot be judged.
+        """
+        heights = np.arange(0.2, 2.3, 0.15)
+        out = []
+        for x, y, d in self.stems:
+            near = (np.hypot(self.points[:, 0] - x, self.points[:, 1] - y) < 0.6) & ~self.made
+            q, g = self.points[near], self.ground(np.array([x, y]))
+            row = np.array([_centre(q[np.abs(q[:, 2] - g - h) < 0.1][:, :2], np.array([x, y]), d) for h in heights])
+            A, w = np.c_[heights, np.ones(len(heights))], np.ones(len(heights))
+            for _ in range(6):
+                line = np.linalg.lstsq(A * w[:, None], row * w[:, None], rcond=None)[0]
+                w = 1.0 / (1.0 + (np.linalg.norm(row - A @ line, axis=1) / 0.02) ** 2)
+            out.append(line)
+        return np.array(out)
+
+    def looks(self, n: int, seed: int, elevation: Array, mount: Array | None = None) -> list[Look]:
+        """`n` sweeps from random places between the stems; `mount` is base_T_lidar (4, 4), level 1 m up when None."""
+        rng = np.random.default_rng(seed)
+        mount = from_xyz_rpy(0, 0, HEIGHT, 0, 0, 0) if mount is None else mount
+        tolerance = min(0.4, 0.5 * float(np.median(np.diff(elevation))))
+        out: list[Look] = []
+        for _ in range(50 * n):
+            if len(out) == n:
+                break
+            xy, yaw = rng.uniform(self.low, self.high), rng.uniform(-np.pi, np.pi)
+            g = self.ground(xy)
+            if np.hypot(*(self.stems[:, :2] - xy).T).min() < 0.9 or np.isnan(g):
+                continue
+            plot_T_base = from_xyz_rpy(xy[0], xy[1], g, 0, 0, yaw)
+            T = plot_T_base @ mount
+            # The sensor may hang anyhow: the cloud is turned into its frame, where the caster looks from the origin.
+            local = (self.points - T[:3, 3]) @ T[:3, :3]
+            xyz, ring = self.sweeps.sweep(local, np.zeros(3), 0.0, np.random.default_rng(seed * 1000 + len(out)), elevation, tolerance_deg=tolerance)  # fmt: skip
+            scan = Scan(1 + len(out) * 10**8, "lidar", xyz, ring, None, None)
+            out.append(Look(scan, plot_T_base, self._shown(transform(T, xyz.astype(float)))))
+        return out
+
+    def _shown(self, seen: Array) -> Array:
+        count = []
+        for x, y, d in self.stems:
+            g = self.ground(np.array([x, y]))
+            near = np.hypot(seen[:, 0] - x, seen[:, 1] - y) < 0.5 * d + 0.12
+            h = seen[near, 2] - (0.0 if np.isnan(g) else g)
+            count.append(((h > 0.25) & (h < 1.7)).sum())
+        return np.array(count) >= 5
+
+
+def _centre(slice_: Array, start: Array, diameter: float) -> Array:
+    """Centre (2,) of the circle in a slice (K, 2), near `start`."""
+    c = start
+    for turn in range(4):
+        off = np.abs(np.linalg.norm(slice_ - c, axis=1) - 0.5 * diameter)
+        w = slice_[off < (0.16 if turn == 0 else 0.06)]
+        if len(w) < 6:
+            break
+        s = np.linalg.lstsq(np.c_[2 * w, np.ones(len(w))], (w**2).sum(1), rcond=None)[0]
+        if np.hypot(*(s[:2] - c)) < 0.4:
+            c = s[:2]
+    return np.asarray(c)
+
+
+@dataclass(frozen=True)
+class SweepResult:
+    """Counts over sweeps: stems shown, shown and found, trunks found, found at a stem; `inside` the stems' outline."""
+
+    shown: int
+    hit: int
+    found: int
+    right: int
+    inside: int
+
+    @property
+    def recall(self) -> float:
+        """Of the stems shown."""
+        return self.hit / max(self.shown, 1)
+
+    @property
+    def precision(self) -> float:
+        """Of all trunks: a stem that the list lacks counts as false."""
+        return self.right / max(self.found, 1)
+
+
+def judge(plot: Plot, looks: list[Look], trunks: list[Trunks]) -> SweepResult:
+    """Trunks that their scan believes in (score >= 0), against the stems of each look."""
+    shown = hit = found = right = inside = 0
+    for look, t in zip(looks, trunks, strict=True):
+        w = transform(look.plot_T_base, t.p[t.score >= 0]) if len(t) else np.zeros((0, 3))
+        i, j = match(w[:, :2], plot.stems[:, :2], GATE)
+        shown += int(look.visible.sum())
+        hit += int(look.visible[j].sum())
+        found += len(w)
+        right += len(i)
+        inside += int(((w[:, :2] > plot.low - GATE) & (w[:, :2] < plot.high + GATE)).all(1).sum())
+    return SweepResult(shown, hit, found, right, inside)
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """A map at known poses: points on the axes (T, 3) at `height` (T,) above ground, kinds, diameters, stated sigma (T,)."""
+
+    p: Array
+    height: Array
+    foot: Array
+    kind: Array
+    diameter: Array
+    sigma: Array
+
+
+def map_at(poses: Array, trunks: list[Trunks], config: Config) -> Mapped:
+    """What the mapper makes of trunks when the path (S, 4, 4) is known."""
+    d = Detections.of(trunks)
+    distance = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))]
+    motion = Motion(d.stamps_ns, poses, distance, np.zeros(len(distance)), True, True)
+    track = follow(d, motion, config.trees)
+    keep = screen(d, track, motion).keep
+    d, track = d.select(keep), np.unique(track[keep], return_inverse=True)[1]
+    seen = transform(poses[d.scan], d.p)
+    variance = 0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1])
+    t = tabulate(d, track, poses, distance)
+    tree = refine(t, np.arange(len(t.hits)), config.trees)[track]
+    n = int(tree.max(initial=-1)) + 1
+    total = np.bincount(tree, 1.0 / variance, n)
+    place = np.stack([np.bincount(tree, seen[:, k] / variance, n) / total for k in range(3)], axis=1)
+    e = exists(d, tree, poses, place, config.trees)
+    s = shapes(d, tree, poses, n)
+    foot = place - s.axis * (s.height / s.axis[:, 2])[:, None]
+    ok = np.flatnonzero(e.ok)
+    return Mapped(place[ok], s.height[ok], foot[ok], e.kind[ok], s.diameter[ok], 1.0 / np.sqrt(total[ok]))
+
+
+def labels() -> Array:
+    """Hand labels of the street's upright things: (L, 4) x, y (m, frame of kiss64.tum), kind 0 tree, 1 post, 2 other, sure."""
+    file = Path(__file__).resolve().parent.parent / "tests" / "promises" / "street_labels.csv"
+    rows = [line.split(",") for line in file.read_text().splitlines()[1:]]
+    return np.array([[float(r[0]), float(r[1]), ("tree", "post", "other").index(r[2]), float(r[4])] for r in rows])
+
+
+def street_map(bag: Path, config: Config) -> TopoMap:
+    """The map of a street bag, in the frame of kiss64.tum."""
+    run = read_run([bag], config)
+    topo = topo_map(solve_run(run, config), config, {})
+    path = np.loadtxt(DATA / "street_avenue" / "kiss64.tum")
+    ends = np.loadtxt(DATA / "street_avenue" / "stamps_ns.txt", dtype=np.int64)[:, 1]
+    at = np.stack([np.interp(topo.stamps_ns, ends, path[:, k]) for k in (1, 2, 3)], axis=1)
+    kiss_T_map = align_se3(topo.map_T_robot[:, :3, 3], at)
+    return replace(topo, p=transform(kiss_T_map, topo.p))
+
+
+def street_bag(out: Path, every_ring: int, first: int = 0, last: int = 300) -> Path:
+    """A bag of the street's clouds with every n-th ring and the reference path as odometry."""
+    if not out.exists():
+        words = ["--every-ring", str(every_ring), "--from", str(first), "--to", str(last), "--odometry"]
+        subprocess.run([sys.executable, str(DATA / "street_bag.py"), str(out), *words], check=True)
+    return out
+
+
+def called_tree(topo: TopoMap, gate: float = 1.0) -> tuple[int, int, list[tuple[float, float, str]]]:
+    """Nodes of kind tree within 25 m of the path, how many of them are labelled trees, and the others as x, y, what."""
+    known = labels()
+    near, _ = cKDTree(np.loadtxt(DATA / "street_avenue" / "kiss64.tum")[:, 1:3]).query(topo.p[:, :2])
+    nodes = topo.p[(topo.kind == 0) & (near < 25.0), :2]
+    d = np.linalg.norm(nodes[:, None] - known[None, :, :2], axis=2)
+    best = d.argmin(axis=1) if len(nodes) else np.zeros(0, int)
+    wrong = []
+    for k, j in enumerate(best):
+        if not (d[k, j] < gate and known[j, 2] == 0) and not (d[k][known[:, 2] == 0] < gate).any():
+            what = ("tree", "post", "other")[int(known[j, 2])] if d[k, j] < gate else "nothing labelled"
+            wrong.append((float(nodes[k, 0]), float(nodes[k, 1]), what))
+    return len(nodes), len(nodes) - len(wrong), wrong

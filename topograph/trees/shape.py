@@ -1,0 +1,161 @@
+"""The shape of each tree from all its sightings: what was measured is added up, the prior applied once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from topograph.geometry import Array, inverse, transform
+from topograph.trees.detections import Detections
+
+LEAN_PRIOR = 0.12
+"""Sigma of a trunk's lean from the vertical, rad (per axis)."""
+DIAMETER_PRIOR = (0.22, 0.25)
+"""Mean and sigma of diameters, m: wide, since orchards differ more than trees of one."""
+ALIKE = 0.1
+"""Share of a sighting's information that is its own: the next scan sees the same bark from nearly the same side."""
+BEND = 0.012
+"""A trunk's axis below what was seen is not the axis seen, rad."""
+STATED_PRIOR = 0.12
+"""Sigma of the lean's prior within a sighting's stated axis (trunks/fit.py), rad."""
+LEVER, SLOPE_X, SLOPE_Y, SLOPE_WEIGHT, WIDE, WIDE_SIGMA = range(6)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shapes:
+    """Of T trees, in the map frame.
+
+    Attributes:
+        slope: (T, 2) horizontal metres per metre of height; `slope_var` (T,).
+        diameter: (T,) m or NaN; `diameter_sigma` (T,).
+        height: (T,) above ground of the point that the sightings state, m.
+        stems: (T,).
+    """
+
+    slope: Array
+    slope_var: Array
+    diameter: Array
+    diameter_sigma: Array
+    height: Array
+    stems: NDArray[np.int64]
+
+    @property
+    def axis(self) -> Array:
+        """(T, 3) unit vectors, up."""
+        a = np.concatenate([self.slope, np.ones((len(self.slope), 1))], axis=1)
+        return np.asarray(a / np.linalg.norm(a, axis=1, keepdims=True))
+
+
+def shapes(detections: Detections, tree: NDArray[np.int64], map_T_scan: Array, n: int) -> Shapes:
+    """Shapes of `n` trees; `tree` (N,) of each detection or -1."""
+    d = detections
+    order = np.argsort(tree, kind="stable")
+    ends = np.searchsorted(tree[order], np.arange(n + 1))
+    slope, weight = _slopes(d, map_T_scan)
+    out = Shapes(
+        slope=np.zeros((n, 2)),
+        slope_var=np.full(n, LEAN_PRIOR**2),
+        diameter=np.full(n, np.nan),
+        diameter_sigma=np.full(n, np.nan),
+        height=np.zeros(n),
+        stems=np.ones(n, np.int64),
+    )
+    for j in range(n):
+        mine = order[ends[j] : ends[j + 1]]
+        if not len(mine):
+            continue
+        out.slope[j], out.slope_var[j] = _together(slope[mine], weight[mine])
+        out.diameter[j], out.diameter_sigma[j] = _thickness(d, mine)
+        above = d.height[mine][np.isfinite(d.height[mine])]
+        out.height[j] = np.median(above) if len(above) else 0.0
+        out.stems[j] = _stems(d, mine)
+    return out
+
+
+def _slopes(d: Detections, map_T_scan: Array) -> tuple[Array, Array]:
+    """Slope (N, 2) of each sighting's axis in the map frame as measured, and its information (N,).
+
+    A source that measures no slope but states an axis (recorded detections) is taken at its word, at 3°.
+    """
+    if not len(d):
+        return np.zeros((0, 2)), np.zeros(0)
+    weight = d.measured[:, SLOPE_WEIGHT].copy()
+    axis = np.concatenate([d.measured[:, [SLOPE_X, SLOPE_Y]], np.ones((len(d), 1))], axis=1)
+    stated = ~np.isfinite(d.kinds).all(axis=1) & (np.abs(d.axis[:, 2]) < 1.0 - 1e-9)
+    axis[stated], weight[stated] = d.axis[stated], 1.0 / 0.05**2
+    turned = (map_T_scan[d.scan, :3, :3] @ axis[:, :, None])[..., 0]
+    flat = np.maximum(turned[:, 2], 0.2)
+    return turned[:, :2] / flat[:, None], np.where(np.abs(turned[:, :2]).max(axis=1) < flat, weight, 0.0)
+
+
+def _together(slope: Array, weight: Array) -> tuple[Array, float]:
+    """Mean slope (2,) with the prior, robust to sightings of something else, and its variance."""
+    prior = 1.0 / LEAN_PRIOR**2
+    if weight.sum() <= 0:
+        return np.zeros(2), LEAN_PRIOR**2
+    w = ALIKE * np.minimum(weight, 1.0 / 0.03**2)
+    mean = np.asarray(w @ slope / w.sum())
+    for _ in range(4):
+        e2 = np.sum((slope - mean) ** 2, axis=1)
+        v = w / (1.0 + e2 / (1.0 / np.maximum(weight, 1e-9) + 0.06**2))
+        mean = np.asarray(v @ slope / v.sum())
+    e2 = np.sum((slope - mean) ** 2, axis=1)
+    spread = float(v @ e2 / v.sum()) / 2.0  # stems and bends: the views do not agree on one axis
+    total = float(v.sum())
+    var = 1.0 / (total + prior) + BEND**2 + 0.15 * spread * (total / (total + prior))
+    return np.asarray(mean * total / (total + prior)), min(var, LEAN_PRIOR**2)
+
+
+def _thickness(d: Detections, mine: NDArray[np.int64]) -> tuple[float, float]:
+    """Diameter and its sigma: the weighted median of what was measured, then the prior; else the median of what was stated."""
+    sigma = d.measured[mine, WIDE_SIGMA]
+    if not (sigma > 0).any():
+        known = d.diameter[mine][np.isfinite(d.diameter[mine])]
+        return (float(np.median(known)), 0.03) if len(known) else (np.nan, np.nan)
+    rows = mine[sigma > 0]
+    sigma = d.measured[rows, WIDE_SIGMA]
+    near = sigma <= np.percentile(sigma, 50)
+    w, x = 1.0 / sigma[near] ** 2, d.measured[rows[near], WIDE]
+    order = np.argsort(x)
+    total = np.cumsum(w[order])
+    middle = float(x[order][np.searchsorted(total, 0.5 * total[-1])])
+    var = float(np.median(sigma[near])) ** 2 / (1.0 + ALIKE * (len(x) - 1)) + 0.015**2
+    mean, prior = DIAMETER_PRIOR[0], DIAMETER_PRIOR[1] ** 2
+    gain = prior / (prior + var)
+    return max(mean + gain * (middle - mean), 0.02), float(np.sqrt(gain * var))
+
+
+def _stems(d: Detections, mine: NDArray[np.int64]) -> int:
+    """Stems that at least a third of the nearer sightings tell apart."""
+    far = np.linalg.norm(d.p[mine, :2], axis=1)
+    near = d.stems[mine[far <= np.median(far)]]
+    return int(max((k for k in range(1, 5) if np.mean(near >= k) >= 1 / 3), default=1))
+
+
+def relevelled(detections: Detections, tree: NDArray[np.int64], map_T_scan: Array, s: Shapes) -> Detections:
+    """The detections with their points moved along their tree's axis, in place of along one scan's guess of it.
+
+    A point was measured at the mean height of its returns; where it is stated above or below, it owes its place to the
+    lean. With the tree's own lean the covariance loses what the guess had added.
+    """
+    d = detections
+    lever = d.measured[:, LEVER]
+    rows = np.flatnonzero((tree >= 0) & (np.abs(lever) > 1e-6))
+    if not len(rows):
+        return d
+    p, cov = d.p.copy(), d.cov.copy()
+    scan, lean = d.scan[rows], lever[rows, None]
+    middle = d.p[rows] - lean * d.axis[rows] / np.maximum(d.axis[rows, 2:], 0.3)
+    T = map_T_scan[scan]
+    up = s.axis[tree[rows]]
+    moved = transform(T, middle) + lean * up / np.maximum(up[:, 2:], 0.3)
+    p[rows] = transform(inverse(T), moved)
+    before = 1.0 / (d.measured[rows, SLOPE_WEIGHT] + 1.0 / STATED_PRIOR**2)
+    change = lever[rows] ** 2 * (s.slope_var[tree[rows]] - before)
+    floor = 0.25 * np.minimum(cov[rows, 0, 0], cov[rows, 1, 1])
+    change = np.maximum(change, -floor)
+    cov[rows, 0, 0] += change
+    cov[rows, 1, 1] += change
+    return replace(d, p=p, cov=cov)

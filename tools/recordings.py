@@ -19,11 +19,13 @@ from scipy.spatial import cKDTree
 from topograph.bags import Scan, Trunks
 from topograph.config import Config
 from topograph.evaluate.metrics import match
-from topograph.geometry import Array, align_se3, from_xyz_rpy, transform
+from topograph.geometry import Array, align_se3, from_quaternion, from_xyz_rpy, inverse, log, transform
 from topograph.motion import Motion
 from topograph.pipeline import read_run, solve_run, topo_map
 from topograph.topomap import TopoMap
 from topograph.trees import Detections, exists, follow, refine, screen, shapes, tabulate
+from topograph.trunks import TrunksConfig, fit
+from topograph.trunks.detector import candidates
 
 DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"
 HEIGHT = 1.0
@@ -258,3 +260,53 @@ def called_tree(topo: TopoMap, gate: float = 1.0) -> tuple[int, int, list[tuple[
             what = ("tree", "post", "other")[int(known[j, 2])] if d[k, j] < gate else "nothing labelled"
             wrong.append((float(nodes[k, 0]), float(nodes[k, 1]), what))
     return len(nodes), len(nodes) - len(wrong), wrong
+
+
+def stem_candidates(name: str, n: int, seed: int) -> tuple[Array, Array]:
+    """Features and classes (0 tree, 2 other, -1 unclear) of candidates in `n` sweeps of a plot, by any sensor in any mounting."""
+    plot, rng = Plot(name), np.random.default_rng([seed, 5])
+    X, y = [], []
+    for k in range(n):
+        elevation = [SENSORS["VLP-16"], SENSORS["64 rings"], np.linspace(-16, 15, 32)][rng.choice(3, p=[0.6, 0.2, 0.2])]
+        roll, pitch = rng.normal(0, 0.15, 2)
+        mount = from_xyz_rpy(0, 0, rng.uniform(0.5, 2.0), roll + np.pi * (rng.random() < 0.1), pitch, 0)
+        for look in plot.looks(1, seed + k, elevation, mount):
+            c = candidates(look.scan, mount, np.zeros(6), TrunksConfig())
+            p = transform(look.plot_T_base, c.fits[:, :3])
+            above = np.clip(c.fits[:, fit.ABOVE], 0.2, 2.3)[:, None, None]
+            at = plot.axes[None, :, 0] * above + plot.axes[None, :, 1]
+            near = (np.linalg.norm(p[:, None, :2] - at, axis=2) - 0.5 * plot.stems[None, :, 2]).min(axis=1)
+            unlisted = (
+                np.hypot(p[:, 0] - UNLISTED[0], p[:, 1] - UNLISTED[1]) if name == "lpine1" else np.full(len(p), 9.0)
+            )
+            inside = ((p[:, :2] > plot.low - 0.3) & (p[:, :2] < plot.high + 0.3)).all(axis=1)
+            X.append(c.features)
+            y.append(np.where(near < 0.12, 0, np.where((near > 0.5) & inside & (unlisted > 1.2), 2, -1)))
+    return np.concatenate(X), np.concatenate(y)
+
+
+UNLISTED = (1.95, 5.6)
+"""A stem with low branches that stands in lpine1's cloud and not in its list, m."""
+
+
+def street_candidates(first: int, last: int, every_ring: int) -> tuple[Array, Array]:
+    """Features and classes of candidates in sweeps of the street, by the hand labels; places drift by up to 0.3 m."""
+    known = labels()
+    path = np.loadtxt(DATA / "street_avenue" / "kiss64.tum")
+    poses = from_quaternion(path[:, 1:4], path[:, 4:])
+    mount = from_xyz_rpy(0, 0, 1.9, 0, 0, 0)
+    X, y = [], []
+    for k, (start, end, xyz, ring, t) in enumerate(module("street_bag").sweeps(first, last, every_ring), first):
+        step = log(inverse(poses[max(k - 1, 0)]) @ poses[k]) / ((end - start) * 1e-9) if k else np.zeros(6)
+        scan = Scan(end, "lidar", xyz.astype(np.float32), ring.astype(np.int32), (t - (end - start) * 1e-9).astype(np.float32), None)  # fmt: skip
+        c = candidates(scan, mount, np.concatenate([step[3:], step[:3]]), TrunksConfig())
+        p = transform(poses[k] @ inverse(mount), c.fits[:, :3])
+        d = np.linalg.norm(p[:, None, :2] - known[None, :, :2], axis=2)
+        kind, near = known[d.argmin(axis=1), 2].astype(int), d.min(axis=1)
+        upright = d[:, known[:, 2] < 2].min(axis=1)
+        sure = known[d.argmin(axis=1), 3] > 0
+        label = np.where((near < 0.45) & (kind < 2) & sure, kind, np.where(upright > 1.3, 2, -1))
+        far = np.hypot(*(p[:, :2] - poses[k, :2, 3]).T)
+        X.append(c.features[far < 22.0])
+        y.append(label[far < 22.0])
+    return np.concatenate(X), np.concatenate(y)

@@ -16,6 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import recordings
 import scenes
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
@@ -29,6 +30,14 @@ from topograph.trunks.features import FEATURES, OVERHEAD
 from topograph.trunks.score import CLIP, ERRORS, forward
 
 HIDDEN = (64, 32)
+SHIPPED = Path(__file__).parent.parent / "topograph" / "trunks" / "score.json"
+RECORDED = 0.2
+"""Weight of one recording against all scenes."""
+RECORDED_AS = {
+    "pine_plot": "real_stems/pine_plot",
+    "lpine1": "real_stems/lpine1",
+    "street": "street_avenue sweeps 0-149",
+}
 DROPPED = 0.3
 """Share of the training's candidates whose view above trunk height is taken away."""
 PURE, IMPURE = 0.6, 0.15
@@ -161,12 +170,37 @@ def error_model(X: Array, e: Array, which: int) -> Array:
     return np.asarray(minimize(cost, np.r_[0.3, np.zeros(len(columns))], jac=True, method="L-BFGS-B").x)
 
 
+def recorded(names: list[str], share: Array) -> tuple[Array, Array, Array]:
+    """Features, classes and weights of candidates of recordings: each of them weighs a share of all that was simulated."""
+    X, y, w = [np.zeros((0, len(FEATURES)))], [np.zeros(0, int)], [np.zeros(0)]
+    for name in names:
+        kept = Path("/tmp") / f"topograph_{name}.npz"
+        if not kept.exists():
+            if name == "street":
+                parts = [recordings.street_candidates(0, 150, every) for every in (1, 2, 4)]
+                found = tuple(np.concatenate([p[k] for p in parts]) for k in range(2))
+            else:
+                found = recordings.stem_candidates(name, 200, 7000)
+            np.savez_compressed(kept, X=found[0], y=found[1])
+        with np.load(kept) as f:
+            sure = f["y"] >= 0
+            X.append(f["X"][sure])
+            y.append(f["y"][sure])
+        w.append((RECORDED * share / np.maximum(np.bincount(y[-1], minlength=3), 1))[y[-1]])
+        print(name, "candidates: tree, post, other:", np.bincount(y[-1], minlength=3))
+    return np.concatenate(X), np.concatenate(y), np.concatenate(w)
+
+
 def main() -> None:
     """Collect, train, calibrate, validate, write."""
     a = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     a.add_argument("--scenes", type=int, default=400)
     a.add_argument("--looks", type=int, default=6)
     a.add_argument("--cache", type=Path, help="keep what was collected here")
+    a.add_argument(
+        "--recorded", nargs="*", default=[], choices=["pine_plot", "lpine1", "street"], help="recordings to train on"
+    )
+    a.add_argument("--out", type=Path, default=SHIPPED)
     a = a.parse_args()
     if a.cache and a.cache.exists():
         with np.load(a.cache) as f:
@@ -187,7 +221,10 @@ def main() -> None:
     # What stands in a scene differs more between scenes than a prior could know; posts are fewer than trees.
     share = np.array([0.45, 0.1, 0.45])
     weight = (share / np.bincount(y, minlength=3))[y]
-    layers = train(np.clip((Z - mean) / deviation, -CLIP, CLIP), y, weight)
+    Zr, yr, wr = recorded(a.recorded, share)
+    Zr[np.ix_(rng.random(len(Zr)) < DROPPED, overhead)] = 0.0
+    every = np.clip((np.concatenate([Z, Zr]) - mean) / deviation, -CLIP, CLIP)
+    layers = train(every, np.concatenate([y, yr]), np.concatenate([weight, wr]))
     N = np.clip((X - mean) / deviation, -CLIP, CLIP)
     one = (y == 0) & (e[:, 6] == 1) & (np.hypot(e[:, 1], e[:, 2]) < 0.25)  # stems of one tree have axes of their own
     commit = subprocess.run(
@@ -196,8 +233,9 @@ def main() -> None:
     data = {
         "trained_by": f"tools/train_score.py --scenes {a.scenes} --looks {a.looks}, after commit {commit}",
         "training_seeds": [0, a.scenes - 1],
+        "recordings": [RECORDED_AS[k] for k in a.recorded],
         "features": list(FEATURES),
-        "mean": mean, "deviation": deviation, "low": Z.min(0), "high": Z.max(0),
+        "mean": mean, "deviation": deviation, "low": np.minimum(Z.min(0), Zr.min(0, initial=1e9)), "high": np.maximum(Z.max(0), Zr.max(0, initial=-1e9)),
         "error_scale": np.stack([error_model(N[one], e[one], k) for k in (0, 1)]),
         "layers": layers,
     }  # fmt: skip
@@ -206,8 +244,7 @@ def main() -> None:
         else np.round(v, 5).tolist() if isinstance(v, np.ndarray) else v
         for k, v in data.items()
     }  # fmt: skip
-    out = Path(__file__).parent.parent / "topograph" / "trunks" / "score.json"
-    out.write_text(json.dumps(text) + "\n")
+    a.out.write_text(json.dumps(text) + "\n")
     print(np.round(data["error_scale"], 2))
     for low, high in ((0, 5), (5, 10), (10, 20), (20, 30)):
         here = one & (e[:, 0] >= low) & (e[:, 0] < high)

@@ -33,7 +33,7 @@ def build(
     foot = estimate.trees - s.axis * (s.height / np.maximum(s.axis[:, 2], 0.3))[:, None]
     cov = estimate.tree_cov.copy()
     # The foot lies `height` below what was measured: the lean's error carries over.
-    cov[:, [0, 1], [0, 1]] += (s.height**2 * s.slope_var)[:, None]
+    cov[:, [0, 1], [0, 1]] += (s.height**2 * s.slope_var + _no_cylinder(s.diameter) ** 2)[:, None]
     viewpoints = _viewpoints(foot, tree, detections, trunks, map_T_scan, config)
     is_tree = existence.kind == TREE
     edges = among(foot[:, :2], is_tree, config)
@@ -61,6 +61,11 @@ def build(
         datum_cov=estimate.datum_cov,
         meta=meta,
     )
+
+
+def _no_cylinder(diameter: Array) -> Array:
+    """Sigma (T,) of the axis of trunks that are the less a cylinder the thicker they are, m: lobes, flares, hollows."""
+    return np.asarray(0.06 * np.maximum(np.nan_to_num(diameter) - 0.25, 0.0))
 
 
 def _viewpoints(

@@ -18,6 +18,10 @@ ALIKE = 0.1
 """Share of a sighting's information that is its own: the next scan sees the same bark from nearly the same side."""
 BEND = 0.012
 """A trunk's axis below what was seen is not the axis seen, rad."""
+FORK = 0.4
+"""Height above ground at which the stems of one tree are taken to part, m."""
+FORKED_LEAN = 0.08
+"""Sigma of the lean below the fork, which no stem shows, rad."""
 STATED_PRIOR = 0.12
 """Sigma of the lean's prior within a sighting's stated axis (trunks/fit.py), rad."""
 LEVER, SLOPE_X, SLOPE_Y, SLOPE_WEIGHT, WIDE, WIDE_SIGMA = range(6)
@@ -71,6 +75,8 @@ def shapes(detections: Detections, tree: NDArray[np.int64], map_T_scan: Array, n
         above = d.height[mine][np.isfinite(d.height[mine])]
         out.height[j] = np.median(above) if len(above) else 0.0
         out.stems[j] = _stems(d, mine)
+        if out.stems[j] > 1:
+            out.slope_var[j] = max(out.slope_var[j], FORKED_LEAN**2)
     return out
 
 
@@ -138,24 +144,51 @@ def relevelled(detections: Detections, tree: NDArray[np.int64], map_T_scan: Arra
     """The detections with their points moved along their tree's axis, in place of along one scan's guess of it.
 
     A point was measured at the mean height of its returns; where it is stated above or below, it owes its place to the
-    lean. With the tree's own lean the covariance loses what the guess had added.
+    lean. With the tree's own lean the covariance loses what the guess had added. Of a tree of several stems each scan
+    saw one or another: their points are stated where stems part, along the axis that the scan saw.
     """
     d = detections
-    lever = d.measured[:, LEVER]
-    rows = np.flatnonzero((tree >= 0) & (np.abs(lever) > 1e-6))
+    own = np.flatnonzero(tree >= 0)
+    several = s.stems[tree[own]] > 1
+    return _at_the_fork(_along(d, tree, own[~several], map_T_scan, s), own[several])
+
+
+def _along(d: Detections, tree: NDArray[np.int64], rows: NDArray[np.int64], map_T_scan: Array, s: Shapes) -> Detections:
+    """Rows of `d` stated on the axes of their trees."""
+    rows = rows[np.abs(d.measured[rows, LEVER]) > 1e-6]
     if not len(rows):
         return d
     p, cov = d.p.copy(), d.cov.copy()
-    scan, lean = d.scan[rows], lever[rows, None]
+    lean = d.measured[rows, LEVER][:, None]
     middle = d.p[rows] - lean * d.axis[rows] / np.maximum(d.axis[rows, 2:], 0.3)
-    T = map_T_scan[scan]
+    T = map_T_scan[d.scan[rows]]
     up = s.axis[tree[rows]]
-    moved = transform(T, middle) + lean * up / np.maximum(up[:, 2:], 0.3)
-    p[rows] = transform(inverse(T), moved)
-    before = 1.0 / (d.measured[rows, SLOPE_WEIGHT] + 1.0 / STATED_PRIOR**2)
-    change = lever[rows] ** 2 * (s.slope_var[tree[rows]] - before)
-    floor = 0.25 * np.minimum(cov[rows, 0, 0], cov[rows, 1, 1])
-    change = np.maximum(change, -floor)
+    p[rows] = transform(inverse(T), transform(T, middle) + lean * up / np.maximum(up[:, 2:], 0.3))
+    change = lean[:, 0] ** 2 * (s.slope_var[tree[rows]] - _stated_lean_var(d, rows))
+    _widen(cov, rows, change)
+    return replace(d, p=p, cov=cov)
+
+
+def _at_the_fork(d: Detections, rows: NDArray[np.int64]) -> Detections:
+    """Rows of `d` stated where the stems of a tree part."""
+    rows = rows[np.isfinite(d.height[rows])]
+    if not len(rows):
+        return d
+    p, cov, height = d.p.copy(), d.cov.copy(), d.height.copy()
+    down = d.height[rows] - FORK
+    p[rows] -= down[:, None] * d.axis[rows] / np.maximum(d.axis[rows, 2:], 0.3)
+    height[rows] = FORK
+    lever = d.measured[rows, LEVER]
+    _widen(cov, rows, ((lever - down) ** 2 - lever**2) * _stated_lean_var(d, rows))
+    return replace(d, p=p, cov=cov, height=height)
+
+
+def _stated_lean_var(d: Detections, rows: NDArray[np.int64]) -> Array:
+    return np.asarray(1.0 / (d.measured[rows, SLOPE_WEIGHT] + 1.0 / STATED_PRIOR**2))
+
+
+def _widen(cov: Array, rows: NDArray[np.int64], change: Array) -> None:
+    """Add `change` (K,) to the horizontal variances of rows of `cov`; a quarter of the least variance stays."""
+    change = np.maximum(change, -0.75 * np.linalg.eigvalsh(cov[rows])[:, 0])
     cov[rows, 0, 0] += change
     cov[rows, 1, 1] += change
-    return replace(d, p=p, cov=cov)

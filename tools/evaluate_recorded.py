@@ -1,4 +1,5 @@
-"""The front end and the map on recorded data, beside the thesis's front end.
+"""The front end and the map on recorded data, beside the thesis's front end. Each plot is judged by a score that was trained on
+scenes and on the other plot (and on the street), never on its own.
 
 python tools/evaluate_recorded.py stems [--seed 2001] [--poses 20]
 """
@@ -6,6 +7,7 @@ python tools/evaluate_recorded.py stems [--seed 2001] [--poses 20]
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 import numpy as np
 import recordings as rec
@@ -27,7 +29,12 @@ MOUNTS = {
 }
 
 
-def stems(seed: int, n: int, thesis: bool) -> None:
+def held_out(name: str) -> Path:
+    """A score that was trained on the other plot and not on this one."""
+    return Path(__file__).resolve().parent.parent / "tests" / "promises" / f"score_without_{name}.json"
+
+
+def stems(seed: int, n: int, thesis: bool, held: bool) -> None:
     """Table of recall and precision a sweep, then the map of the level VLP-16 sweeps at their true poses."""
     for name in ("pine_plot", "lpine1"):
         plot = rec.Plot(name)
@@ -37,7 +44,7 @@ def stems(seed: int, n: int, thesis: bool) -> None:
                     continue
                 T = from_xyz_rpy(*pose)
                 looks = plot.looks(n, seed, elevation, T)
-                rivals = {"ours": Detector(T, TrunksConfig())}
+                rivals = {"ours": Detector(T, TrunksConfig(score=str(held_out(name)) if held else ""))}
                 if thesis and mount == "level":
                     rivals["thesis"] = ThesisDetector(T, ThesisTrunksConfig())
                 for who, detect in rivals.items():
@@ -75,8 +82,11 @@ def main() -> None:
     a.add_argument("--seed", type=int, default=2001, help="of the poses; below 1000 were looked at while building")
     a.add_argument("--poses", type=int, default=20)
     a.add_argument("--thesis", action="store_true")
+    a.add_argument(
+        "--shipped", action="store_true", help="the shipped score, which other sweeps of these plots trained"
+    )
     a = a.parse_args()
-    stems(a.seed, a.poses, a.thesis)
+    stems(a.seed, a.poses, a.thesis, not a.shipped)
 
 
 if __name__ == "__main__":

@@ -58,6 +58,10 @@ def shapes(detections: Detections, tree: NDArray[np.int64], map_T_scan: Array, n
     order = np.argsort(tree, kind="stable")
     ends = np.searchsorted(tree[order], np.arange(n + 1))
     slope, weight = _slopes(d, map_T_scan)
+    # Recorded detections lie at one height, which each scan states from where it stands: all of them say it together.
+    measured = np.isfinite(d.kinds).any()
+    stated = d.height[np.isfinite(d.height)]
+    common = float(np.median(stated)) if len(stated) else 0.0
     out = Shapes(
         slope=np.zeros((n, 2)),
         slope_var=np.full(n, LEAN_PRIOR**2),
@@ -73,7 +77,7 @@ def shapes(detections: Detections, tree: NDArray[np.int64], map_T_scan: Array, n
         out.slope[j], out.slope_var[j] = _together(slope[mine], weight[mine])
         out.diameter[j], out.diameter_sigma[j] = _thickness(d, mine)
         above = d.height[mine][np.isfinite(d.height[mine])]
-        out.height[j] = np.median(above) if len(above) else 0.0
+        out.height[j] = np.median(above) if len(above) and measured else common
         out.stems[j] = _stems(d, mine)
         if out.stems[j] > 1:
             out.slope_var[j] = max(out.slope_var[j], FORKED_LEAN**2)

@@ -18,6 +18,7 @@ class TrunksConfig:
         widest, thinnest: diameters of a trunk.
         prior_diameter, prior_sigma: of trunks too coarsely seen to measure.
         min_score: log-odds (tree or post) below which a candidate is dropped; what a scan doubts, many scans decide.
+        score: file of another score, as tools/train_score.py writes it; "": the shipped one.
         recorded_sigma, recorded_growth, recorded_along: first guess of the noise of recorded detections: at the
             sensor, per metre of range, and along the axis (where on the trunk a detection lies is not stated, and
             in recordings it moves with the sensor's height: next to no information).
@@ -35,6 +36,7 @@ class TrunksConfig:
     prior_diameter: float = 0.25
     prior_sigma: float = 0.09
     min_score: float = -2.0
+    score: str = ""
     recorded_sigma: float = 0.05
     recorded_growth: float = 0.01
     recorded_along: float = 5.0

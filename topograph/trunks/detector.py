@@ -114,12 +114,13 @@ class Detector:
     def __init__(self, base_T_lidar: Array, config: TrunksConfig) -> None:
         self.base_T_lidar = np.ascontiguousarray(base_T_lidar, float)
         self.config = config
+        self.network = scoring.network(config.score)
 
     def __call__(self, scan: Scan, twist: Array, up: Array | None = None) -> Trunks:
         c = candidates(scan, self.base_T_lidar, np.asarray(twist, float), self.config, up)
         if len(c.fits) == 0:
             return none_at(scan.stamp_ns)
-        kinds = scoring.kinds(c.features)
+        kinds = scoring.kinds(c.features, self.network)
         odds = scoring.column_odds(kinds)
         keep = odds > self.config.min_score
         fits, kinds, odds, name = c.fits[keep], kinds[keep], odds[keep], c.name[keep]
@@ -134,7 +135,7 @@ class Detector:
             p=merged[:, :3],
             axis=merged[:, 3:6],
             diameter=merged[:, fitting.DIAMETER],
-            cov=covariances(merged, scoring.error_scales(c.features[keep][best])),
+            cov=covariances(merged, scoring.error_scales(c.features[keep][best], self.network)),
             height=merged[:, fitting.ABOVE],
             score=scoring.tree_odds(kinds[best]),
             clouds=tuple(c.points[rows[a:b]] for a, b in pairwise(ends.tolist())),

@@ -6,10 +6,12 @@ import functools
 import json
 from dataclasses import dataclass
 from importlib import resources
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from topograph.errors import InputError
 from topograph.geometry import Array
 from topograph.trunks.features import FEATURES
 
@@ -28,6 +30,7 @@ class Network:
 
     Attributes:
         mean, deviation: (F,) of the features in training; `low`, `high` (F,) their range there.
+        error_scale: (2, 1 + len(ERRORS)) weights of the model of radial and tangential deviations.
         layers: weights and offsets of each layer in turn.
     """
 
@@ -35,32 +38,30 @@ class Network:
     deviation: Array
     low: Array
     high: Array
+    error_scale: Array
     layers: list[NDArray[np.float32]]
 
 
-@functools.lru_cache(maxsize=1)
-def _file() -> dict[str, object]:
-    data: dict[str, object] = json.loads(resources.files("topograph.trunks").joinpath("score.json").read_text())
-    return data
-
-
-@functools.lru_cache(maxsize=1)
-def network() -> Network:
-    """The shipped weights.
+@functools.lru_cache(maxsize=4)
+def network(file: str = "") -> Network:
+    """The weights of a `score` file; "": the shipped one.
 
     Raises:
-        ValueError: the file was trained for other features.
+        InputError: the file cannot be read, or was trained for other features.
     """
-    data = _file()
-    if tuple(data["features"]) != FEATURES:  # type: ignore[arg-type]  # json knows no tuples
-        raise ValueError("trunks/score.json was trained for other features: run tools/train_score.py")
-    row = {k: np.array(data[k], float) for k in ("mean", "deviation", "low", "high")}
-    return Network(layers=[np.array(v, np.float32) for v in data["layers"]], **row)  # type: ignore[attr-defined]  # json's object
+    try:
+        at = resources.files("topograph.trunks").joinpath("score.json") if file == "" else Path(file)
+        data = json.loads(at.read_text())
+        if tuple(data["features"]) != FEATURES:
+            raise InputError(f"{file or 'trunks/score.json'} was trained for other features: run tools/train_score.py")
+        row = {k: np.array(data[k], float) for k in ("mean", "deviation", "low", "high", "error_scale")}
+        return Network(layers=[np.array(v, np.float32) for v in data["layers"]], **row)
+    except (OSError, ValueError, KeyError, TypeError) as err:
+        raise InputError(f"{file}: not a score file ({err}); tools/train_score.py writes them") from err
 
 
-def kinds(features: Array) -> Array:
+def kinds(features: Array, n: Network) -> Array:
     """Log-probabilities (C, 3) of KINDS of candidates with `features` (C, len(FEATURES))."""
-    n = network()
     x = np.clip((features - n.mean) / n.deviation, -CLIP, CLIP).astype(np.float32)
     z = forward(x, n.layers)
     # Outside of what was trained on nobody knows: the answer is drawn towards "undecided", and many sightings decide.
@@ -91,17 +92,10 @@ ERRORS = ("range", "points", "width_spread", "line_rms", "rough", "free", "under
 """Features that say how far a fit is to be trusted: what is half hidden, or not one column, is farther off."""
 
 
-@functools.lru_cache(maxsize=1)
-def _error_model() -> tuple[NDArray[np.int64], Array]:
-    data = _file()
-    return np.array([FEATURES.index(k) for k in ERRORS]), np.array(data["error_scale"], float)
-
-
-def error_scales(features: Array) -> Array:
+def error_scales(features: Array, n: Network) -> Array:
     """Factors (C, 2) on the radial and tangential deviations of fits with `features`, learned from their errors: a
     log-linear model of the deviation.
     """
-    columns, weights = _error_model()
-    n = network()
+    columns = [FEATURES.index(k) for k in ERRORS]
     x = np.clip((features[:, columns] - n.mean[columns]) / n.deviation[columns], -CLIP, CLIP)
-    return np.asarray(np.exp(np.clip(x @ weights[:, 1:].T + weights[:, 0], -1.0, 2.5)))
+    return np.asarray(np.exp(np.clip(x @ n.error_scale[:, 1:].T + n.error_scale[:, 0], -1.0, 2.5)))

@@ -18,6 +18,7 @@ from topograph.localize.method import Fix, Method, Report
 from topograph.localize.submap import Move, Sweep
 from topograph.motion import Leg, Reckoner, twist_during, up_at
 from topograph.topomap import TopoMap
+from topograph.trunks import smeared
 
 Detect = Callable[[Scan, Array, Array | None], Trunks]
 
@@ -66,9 +67,14 @@ class Localizer:
             last = scan.stamp_ns + (
                 0 if scan.offset is None or not len(scan.offset) else int(np.nanmax(scan.offset) * 1e9)
             )
-            twist, _ = twist_during(scan.stamp_ns, last, self._recent_odometry, self._recent_imu, self._robot_R_imu)
+            twist, source = twist_during(
+                scan.stamp_ns, last, self._recent_odometry, self._recent_imu, self._robot_R_imu
+            )
             up = up_at(scan.stamp_ns, self._recent_odometry, self._recent_imu, self._robot_R_imu)
+            timed = scan.offset is not None
             scan = self._detect(scan, twist, up)
+            if not timed or source == "none":
+                scan = smeared(scan, twist, source != "none")
         del self._recent_odometry[:-200], self._recent_imu[:-500]
         self.leg = self.reckoner.advance(scan.stamp_ns)
         self.report = self.method.step(scan, self.leg)

@@ -233,7 +233,10 @@ class _Association:
         if self.problem.known is not None:  # what the map knows exists, however rarely this run saw it
             keep[self.tree_of_track[self.tracks :]] = True
         problem, tree, final = self.with_trees(self.tree_of_track, 1, keep)
-        own = relevelled(d, tree, map_T_scan, shapes(d, tree, map_T_scan, len(final)))
+        shape = shapes(d, tree, map_T_scan, len(final))
+        if problem.known is not None:  # the map states its trees at one height, whatever their stems
+            shape.stems[problem.known.tree[problem.known.tree >= 0]] = 1
+        own = relevelled(d, tree, map_T_scan, shape)
         sightings = gather(own, tree, problem.stamps_ns, problem.motion)
         problem = replace(problem, start=e.map_T_robot, detections=own, sightings=sightings)
         return tree, problem, found.select(np.searchsorted(ids, final)), int((~found.ok).sum())

@@ -24,7 +24,7 @@ class Viewpoint:
 
 KINDS = ("tree", "post", "other")
 """What a landmark can be."""
-TREE = 0
+TREE, POST, OTHER = range(3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from topograph.geometry import Array
 from topograph.topomap.edges import TopomapConfig, among
-from topograph.topomap.map import TREE, TopoMap, Viewpoint
+from topograph.topomap.map import OTHER, TREE, TopoMap, Viewpoint
 from topograph.topomap.rows import find_rows
 
 
@@ -47,7 +47,13 @@ def merge(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64], config: To
             views.append(moved)
         elif len(v.cloud) > len(views[twin[0]].cloud):
             views[twin[0]] = moved
-    kind = both("kind").astype(np.int64)
+    told = _told_better(old, new, tree_of_old)
+    kind, chance, stems = (
+        np.concatenate([np.where(told, getattr(new, k)[tree_of_old], getattr(old, k)), getattr(new, k)[fresh]])
+        if len(new)
+        else getattr(old, k)
+        for k in ("kind", "kind_probability", "stems")
+    )
     edges = among(p[:, :2], kind == TREE, config)
     stamps = np.concatenate([old.stamps_ns, new.stamps_ns])
     poses = np.concatenate([old.map_T_robot, new.map_T_robot])
@@ -65,8 +71,8 @@ def merge(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64], config: To
         score=both("score"),
         row=row,
         kind=kind,
-        kind_probability=both("kind_probability"),
-        stems=both("stems").astype(np.int64),
+        kind_probability=chance,
+        stems=stems,
         edges=edges,
         lengths=np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1),
         viewpoints=tuple(views),
@@ -75,3 +81,13 @@ def merge(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64], config: To
         datum_cov=old.datum_cov,
         meta=new.meta,
     )
+
+
+def _told_better(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(T_old,) trees of which the new run says better what they are: it tells kinds, not merely "something else", from as
+    many sightings as the old map had, or the old map had been told nothing.
+    """
+    if not len(new):
+        return np.zeros(len(old), bool)
+    tells = (tree_of_old >= 0) & np.isfinite(new.kind_probability[tree_of_old]) & (new.kind[tree_of_old] != OTHER)
+    return np.asarray(tells & (np.isnan(old.kind_probability) | (new.sightings[tree_of_old] >= old.sightings)))

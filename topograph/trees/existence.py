@@ -21,6 +21,10 @@ MOST = 6.0
 """Sightings that count at most: looks from all sides still share the tree."""
 SLIPS = 2.0
 """Scans that may have seen through a tree by mistake: a mixed pixel, a pose that is off for a moment."""
+UNUSUAL = 1.0
+"""Log-odds below the run's median that a tree may always score."""
+BLOCK = 100_000
+"""Pairs of scans and trees that are looked at together."""
 REACH = 31.0
 """Beyond this no scan records what it saw through, m."""
 
@@ -63,7 +67,7 @@ def exists(
     score = np.bincount(tree[used], d.score[used], minlength=n) / np.maximum(hits, 1)
     scan, which = _pairs(d, map_T_scan, places)
     seen = np.isin(scan * n + which, d.scan[used] * n + tree[used])
-    p = transform(inverse(map_T_scan)[scan], places[which]) if len(scan) else np.zeros((0, 3))
+    p = _seen_from(map_T_scan, scan, places, which)
     passed = np.zeros(n, np.int64)
     # A few false detections may fall on one spot; a tree of the run's own kind is seen far more often.
     typical = float(np.median(hits[hits >= config.min_sightings])) if (hits >= config.min_sightings).any() else 0.0
@@ -75,10 +79,11 @@ def exists(
     else:
         ok &= _shown_often(scan, which, p, seen, hits, n, config)
     kind, probability = _kinds(d, tree, n)
-    if np.isfinite(probability).any():
+    if (d.score[used] != 0.0).any():  # recorded detections may come without
         # Scores differ between sensors and orchards: what counts is also how this run's own trees score.
         surely = ok & (kind == TREE)
-        ok &= (kind != TREE) | (score >= config.usual_score * _usual(score[surely], hits[surely]))
+        usual = _usual(score[surely], hits[surely])
+        ok &= (kind != TREE) | (score >= min(config.usual_score * usual, usual - UNUSUAL))
     return Existence(ok=ok & (kind != OTHER), kind=kind, probability=probability, score=score, hits=hits, passed=passed)
 
 
@@ -99,6 +104,16 @@ def _pairs(d: Detections, map_T_scan: Array, places: Array) -> tuple[NDArray[np.
     near = cKDTree(places[:, :2]).query_ball_point(map_T_scan[:, :2, 3], reach)
     rows = [np.asarray(k, np.int64) for k in near]
     return np.repeat(np.arange(len(rows)), [len(k) for k in rows]), np.concatenate(rows)
+
+
+def _seen_from(map_T_scan: Array, scan: NDArray[np.int64], places: Array, which: NDArray[np.int64]) -> Array:
+    """(P, 3) places in the base frames of scans, pair by pair; in blocks, since pairs are many."""
+    scan_T_map = inverse(map_T_scan)
+    out = np.empty((len(scan), 3))
+    for at in range(0, len(scan), BLOCK):
+        part = slice(at, at + BLOCK)
+        out[part] = transform(scan_T_map[scan[part]], places[which[part]])
+    return out
 
 
 def _through(d: Detections, scan: NDArray[np.int64], p: Array) -> NDArray[np.bool_]:

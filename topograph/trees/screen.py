@@ -20,6 +20,8 @@ SWAY = 0.25
 """A still thing's place may differ so much between its first and last sightings, m: bark, lean, another side of it."""
 TURN_DRIFT = 0.02
 """The same per radian turned, at one metre of range, rad."""
+TURN_DRIFT_WHEELS = 0.2
+"""The same where no gyro measures turns, rad."""
 DOUBT = -0.7
 """Mean log-odds (tree or post) below which a track is not a column."""
 
@@ -39,7 +41,8 @@ def screen(detections: Detections, track: NDArray[np.int64], motion: Motion) -> 
     n = int(track.max(initial=-1)) + 1
     if n == 0:
         return Screened(np.zeros(0, bool), 0, 0)
-    moving = _moving(d, track, n, motion)
+    # Where fixes stand in for wheels, what seems to move may be the robot.
+    moving = _moving(d, track, n, motion) if motion.wheels else np.zeros(n, bool)
     doubted = np.zeros(n, bool)
     odds = column_odds(d.kinds)
     told = np.isfinite(odds)
@@ -73,6 +76,6 @@ def _moving(d: Detections, track: NDArray[np.int64], n: int, motion: Motion) -> 
         far = float(np.median(np.linalg.norm(d.p[rows, :2], axis=1)))
         noise = 3.0 * float(np.median(sigma[rows])) / np.sqrt(third)
         drift = DRIFT * float(driven[rows[-1]] - driven[rows[0]])
-        drift += TURN_DRIFT * far * float(turned[rows[-1]] - turned[rows[0]])
+        drift += (TURN_DRIFT if motion.gyro else TURN_DRIFT_WHEELS) * far * float(turned[rows[-1]] - turned[rows[0]])
         out[k] = shift > SWAY + noise + drift
     return out

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 
@@ -67,6 +67,7 @@ def candidates(
     the base's frame, horizontal metres per metre of height, where it is known: else the trunks tell.
     """
     scan = once(scan)
+    twist = np.nan_to_num(twist, posinf=0.0, neginf=0.0)
     if len(scan.xyz) == 0:
         return _NOTHING
     R = base_T_lidar[:3, :3]
@@ -119,7 +120,7 @@ class Detector:
     def __call__(self, scan: Scan, twist: Array, up: Array | None = None) -> Trunks:
         c = candidates(scan, self.base_T_lidar, np.asarray(twist, float), self.config, up)
         if len(c.fits) == 0:
-            return none_at(scan.stamp_ns)
+            return replace(none_at(scan.stamp_ns), free=c.free, eye=self.base_T_lidar[:3, 3])
         kinds = scoring.kinds(c.features, self.network)
         odds = scoring.column_odds(kinds)
         keep = odds > self.config.min_score

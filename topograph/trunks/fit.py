@@ -22,6 +22,8 @@ RING_SIGMA = 0.035
 """Of one return's place across the axis, m: range noise and bark."""
 ALIKE = 6.0
 """Returns of one ring share their error: so many count as one."""
+STRAIGHT, BENDS = 0.9, 0.25
+"""Height up to which a trunk is taken for straight, and over which it may bend, m."""
 PUSH = 0.83
 """The mean return of a cylinder lies π/4 of its radius before the axis; mixed pixels at the edges take away the rest."""
 
@@ -124,7 +126,9 @@ def axis_of(runs, mine, w, mean_width, radius, eye, step, far, up, row):
         cx[q], cy[q], cz[q] = runs[i, PX] + dx / d * push, runs[i, PY] + dy / d * push, runs[i, PZ]
         # A ring that is much wider or narrower than the others is partly hidden, or not only trunk.
         odd = (w[q] - mean_width) / (0.05 + step * far)
-        cw[q] = min(runs[i, COUNT], 12.0) / (1.0 + odd * odd)
+        # Trunks bend: the axis wanted is that of the lower part, which ends at the foot.
+        high = max(runs[i, HEIGHT] - STRAIGHT, 0.0) / BENDS
+        cw[q] = min(runs[i, COUNT], 12.0) / ((1.0 + odd * odd) * (1.0 + high * high))
     prior = RING_SIGMA**2 * ALIKE / LEAN_SIGMA_PRIOR**2
     szz, szx, szy, zm, xm, ym, lx, ly = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for turn in range(3):
@@ -255,12 +259,14 @@ def merge_stems(fits, odds, group):
         best[b] = i
         out[b] = fits[i]
         total, stems = 0.0, 0
-        mean = np.zeros(6)
+        mean, lever, above = np.zeros(6), 0.0, 0.0
         for j in range(n):
             if group[j] != i or odds[j] <= min(0.5 * odds[i], odds[i] - 1.0) or fits[j, WIDE] < 0.33 * fits[i, WIDE]:
                 continue
             total += fits[j, POINTS]
             stems += 1
+            lever += fits[j, POINTS] * fits[j, LEVER]
+            above += fits[j, POINTS] * fits[j, ABOVE]
             for q in range(6):
                 mean[q] += fits[j, POINTS] * fits[j, q]
         if stems > 1:
@@ -269,7 +275,8 @@ def merge_stems(fits, odds, group):
                 out[b, q] = mean[q] / (total if q < 3 else size)
             out[b, RADIAL] = np.hypot(out[b, RADIAL], 0.05)
             out[b, TANGENTIAL] = np.hypot(out[b, TANGENTIAL], 0.05)
-            out[b, SLOPE_WEIGHT] = 0.0  # the mean of stems is no axis that was measured
+            out[b, LEVER], out[b, ABOVE] = lever / total, above / total
+            out[b, SLOPE_WEIGHT], out[b, LEAN_SIGMA] = 0.0, LEAN_SIGMA_PRIOR  # the mean of stems is no axis measured
             out[b, STEMS] = stems
         b += 1
     return best[:b], out[:b]

@@ -116,6 +116,8 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
     for i in range(n):
         k = ring[i]
         inside[i] &= (k >= 0) & (k < n_rings)
+        if timed and offset[i] != offset[i]:  # NaN: nobody knows when
+            inside[i] = False
         if inside[i]:
             if before[k, 0] == xyz[i, 0] and before[k, 1] == xyz[i, 1] and before[k, 2] == xyz[i, 2]:
                 inside[i] = False

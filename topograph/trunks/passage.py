@@ -51,7 +51,7 @@ def ring_image(p, r, starts, eye):
         for i in range(starts[k], starts[k + 1]):
             x, y = p[i, 0] - ex, p[i, 1] - ey
             a = abs(x) + abs(y)
-            if a <= zero:
+            if not a > zero:  # NaN too
                 continue
             t = y / a  # bin_of, inlined in single precision: this is a loop over all points
             if x < zero:
@@ -70,12 +70,22 @@ def ring_image(p, r, starts, eye):
 
 
 @njit(cache=True)
+def _cells(first, last):
+    """A word with the bits of the cells from `first` up to before `last`, m."""
+    i0, i1 = max(int(first), 0), min(int(np.floor(last)), CELLS)
+    if i1 <= i0:
+        return np.uint32(0)
+    word = np.uint32(0xFFFFFFFF) if i1 == CELLS else (np.uint32(1) << np.uint32(i1)) - np.uint32(1)
+    return word & ~((np.uint32(1) << np.uint32(i0)) - np.uint32(1))
+
+
+@njit(cache=True)
 def passage(near, slope, eye, plane, grid):
     """Places seen through: (SECTORS,) words, bit i of one is set when all beams of that direction that could have met
     a trunk i to i + 1 m away went on, at the height of a trunk. Directions are in the base's axes, about the sensor.
     """
     rings = near.shape[0]
-    free = np.zeros(BINS, np.uint32)
+    free, met = np.zeros(BINS, np.uint32), np.zeros(BINS, np.uint32)
     known = np.zeros(BINS, np.bool_)
     i, j = int(eye[0] + HALF), int(eye[1] + HALF)
     under = plane[0] + plane[1] * eye[0] + plane[2] * eye[1]
@@ -101,6 +111,8 @@ def passage(near, slope, eye, plane, grid):
                 continue
             known[b] = True
             s = slope[k, b] - fall
+            if LOW < high + s * q < HIGH:  # it met something as high as a trunk: others may pass above and below that
+                met[b] |= _cells(q - MARGIN, q + MARGIN + 1.0)
             first, last = 0.0, q - MARGIN
             if s < 0:
                 last = min(last, (LOW - high) / s) if high > LOW else 0.0
@@ -112,13 +124,7 @@ def passage(near, slope, eye, plane, grid):
                     first = (LOW - high) / s
             elif not LOW < high < HIGH:
                 continue
-            i0, i1 = int(np.ceil(first)), int(np.floor(last))  # whole cells only
-            if i1 > CELLS:
-                i1 = CELLS
-            if i1 <= i0:
-                continue
-            word = full if i1 == CELLS else (np.uint32(1) << np.uint32(i1)) - np.uint32(1)
-            free[b] |= word & ~((np.uint32(1) << np.uint32(i0)) - np.uint32(1))
+            free[b] |= _cells(np.ceil(first), last)  # whole cells only
     out = np.full(SECTORS, full, np.uint32)
     some = np.zeros(SECTORS, np.bool_)
     for b in range(BINS):
@@ -135,7 +141,7 @@ def passage(near, slope, eye, plane, grid):
             else:
                 dx, dy = t - 3, t - 4
             k = int((np.arctan2(dy, dx) + np.pi) * (SECTORS / (2 * np.pi))) % SECTORS
-            out[k] &= free[b]
+            out[k] &= free[b] & ~met[b]
             some[k] = True
     for k in range(SECTORS):
         if not some[k]:

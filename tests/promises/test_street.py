@@ -22,7 +22,9 @@ def test_nodes_stand_still_and_stop_the_beam(shared: Path, tmp_path_factory: pyt
     seen = transform(map_T_scans(solved)[d.scan], d.p)[:, :2]
     for tree in range(len(e.ok)):
         mine = np.flatnonzero(solved.tree == tree)
-        part = max(len(mine) // 4, 1)
+        part = len(mine) // 4
+        if part < 3:  # one odd sighting of a few is no motion
+            continue
         shift = np.median(seen[mine[-part:]], axis=0) - np.median(seen[mine[:part]], axis=0)
         # A pillar a metre thick shows another side when passed; a vehicle that moves goes further.
         assert np.linalg.norm(shift) < 1.0

@@ -6,6 +6,7 @@ A tree stands still in the world for longer than it is followed. Nothing of this
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,12 @@ from topograph.trees.detections import Detections
 
 DRIFT = 0.05
 """Share of the distance driven that dead reckoning may put a still thing off while it is followed."""
-SWAY = 0.25
-"""A still thing's place may differ so much between its first and last sightings, m: bark, lean, another side of it."""
+NOISE = 0.35
+"""What noise may explain at most, m: a thing whose place is known no better marks none."""
+GROUPS = 4
+"""Parts of a track, in time, that are compared."""
+SWAY = 0.3
+"""A still thing's place may differ so much between parts of its track, m: another side of it, another stem."""
 TURN_DRIFT = 0.02
 """The same per radian turned, at one metre of range, rad."""
 TURN_DRIFT_WHEELS = 0.2
@@ -61,21 +66,31 @@ def column_odds(kinds: Array) -> Array:
 
 
 def _moving(d: Detections, track: NDArray[np.int64], n: int, motion: Motion) -> NDArray[np.bool_]:
-    """Tracks (n,) whose last sightings lie elsewhere than the first by more than dead reckoning and a trunk explain."""
+    """Tracks (n,) of which two parts lie further apart than dead reckoning and a trunk explain."""
     place = transform(motion.at(d.stamps_ns)[d.scan], d.p)[:, :2]
-    driven, turned = motion.distance_at(d.stamps_ns)[d.scan], motion.turned_at(d.stamps_ns)[d.scan]
-    order = np.lexsort((d.scan, track))
-    ends = np.searchsorted(track[order], np.arange(n + 1))
-    out = np.zeros(n, bool)
+    far = np.linalg.norm(d.p[:, :2], axis=1)
+    mean_far = (np.bincount(track, far, n) / np.maximum(np.bincount(track, minlength=n), 1))[track]
+    bend = TURN_DRIFT if motion.gyro else TURN_DRIFT_WHEELS
+    drift = DRIFT * motion.distance_at(d.stamps_ns)[d.scan] + bend * mean_far * motion.turned_at(d.stamps_ns)[d.scan]
+    return parts_apart(place, d, track, n, drift, SWAY)
+
+
+def parts_apart(
+    place: Array, d: Detections, label: NDArray[np.int64], n: int, drift: Array, sway: float
+) -> NDArray[np.bool_]:
+    """Labels (n,) of whose sightings at `place` (N, 2) two parts in time lie further apart than `sway`, their noise and the
+    difference of `drift` (N,) between them, m.
+    """
+    order = np.lexsort((d.scan, label))
+    ends = np.searchsorted(label[order], np.arange(n + 1))
     sigma = np.sqrt(0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1]))
-    for k in np.flatnonzero(np.diff(ends) >= 4):
+    out = np.zeros(n, bool)
+    for k in np.flatnonzero(np.diff(ends) >= GROUPS):
         rows = order[ends[k] : ends[k + 1]]
-        third = max(len(rows) // 4, 1)
-        first, last = rows[:third], rows[-third:]
-        shift = float(np.linalg.norm(np.median(place[last], axis=0) - np.median(place[first], axis=0)))
-        far = float(np.median(np.linalg.norm(d.p[rows, :2], axis=1)))
-        noise = 3.0 * float(np.median(sigma[rows])) / np.sqrt(third)
-        drift = DRIFT * float(driven[rows[-1]] - driven[rows[0]])
-        drift += (TURN_DRIFT if motion.gyro else TURN_DRIFT_WHEELS) * far * float(turned[rows[-1]] - turned[rows[0]])
-        out[k] = shift > SWAY + noise + drift
+        groups = np.array_split(rows, GROUPS)
+        middle = np.array([np.median(place[g], axis=0) for g in groups])
+        way = np.array([np.median(drift[g]) for g in groups])
+        noise = min(3.0 * float(np.median(sigma[rows])) / np.sqrt(len(rows) / GROUPS), NOISE)
+        for i, j in combinations(range(GROUPS), 2):
+            out[k] |= np.linalg.norm(middle[j] - middle[i]) > sway + noise + abs(way[j] - way[i])
     return out

@@ -18,6 +18,8 @@ CELLS = 32
 """Cells of 1 m in range of the record of passage: the bits of one word."""
 MARGIN = 0.45
 """A beam has passed a place when it met something no nearer than this behind it, m."""
+THICK = 0.2
+"""So far before and behind a return the thing that was met may reach, m."""
 LOW, HIGH = 0.4, 1.6
 """Heights between which a beam that passes contradicts a trunk, m: above weeds, below crowns."""
 
@@ -112,7 +114,7 @@ def passage(near, slope, eye, plane, grid):
             known[b] = True
             s = slope[k, b] - fall
             if LOW < high + s * q < HIGH:  # it met something as high as a trunk: others may pass above and below that
-                met[b] |= _cells(q - MARGIN, q + MARGIN + 1.0)
+                met[b] |= _cells(q - THICK, q + THICK + 1.0)
             first, last = 0.0, q - MARGIN
             if s < 0:
                 last = min(last, (LOW - high) / s) if high > LOW else 0.0

@@ -60,9 +60,9 @@ def exists(
 ) -> Existence:
     """Which of the trees at `places` (T, 3) exist, and what they are.
 
-    A scan that saw a trunk speaks for it, a scan whose beams went on through its place at trunk height against it, and
-    more weakly one that should have shown it and did not; a scan whose view was blocked says nothing. The chance of
-    detection by range and bearing is learned from the run.
+    A scan that saw a trunk speaks for it, a scan whose beams went on through its place at trunk height against it;
+    a scan whose view was blocked says nothing. Without a record of passage (recorded detections) the scans that should
+    have shown a tree and did not take that part; the chance of detection by range and bearing is learned from the run.
     """
     d, n = detections, len(places)
     used = tree >= 0
@@ -75,13 +75,14 @@ def exists(
     # A few false detections may fall on one spot; a tree of the run's own kind is seen far more often.
     typical = float(np.median(hits[hits >= config.min_sightings])) if (hits >= config.min_sightings).any() else 0.0
     ok = hits >= max(config.min_sightings, config.min_share * typical)
-    ok &= _shown_often(scan, which, p, seen, hits, n, config)
     if len(d.free):
         through = _through(d, scan, p) & ~seen
         passed = np.bincount(which[through], minlength=n)
         ok &= passed <= config.passed * hits + SLIPS
         in_map = transform(map_T_scan[d.scan], d.p)[:, :2]
         ok &= ~parts_apart(in_map, d, tree, n, np.zeros(len(d)), STILL)
+    else:
+        ok &= _shown_often(scan, which, p, seen, hits, n, config)
     kind, probability = _kinds(d, tree, n)
     if (d.score[used] != 0.0).any():  # recorded detections may come without
         # Scores differ between sensors and orchards: what counts is also how this run's own trees score.

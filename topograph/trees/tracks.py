@@ -27,7 +27,7 @@ class TreesConfig:
         mapped: chance that a trunk seen on old ground is already in the map.
         margin: log-odds by which a loop must beat its rivals and the absence of a loop.
         merge: two trees nearer than this are one (stems of one tree), m.
-        min_sightings, min_ratio: of a tree that exists; ratio of sightings to scans that should show it;
+        min_sightings, min_ratio: of a tree that exists; ratio of sightings to scans that should show it (recorded detections);
         passed: scans that saw through its place, for each that saw it, that a tree survives;
         usual_score: share of the run's median score of trees that is enough;
         min_share: of the sightings that trees of the same run have at the median.
@@ -43,7 +43,7 @@ class TreesConfig:
     margin: float = 7.0
     merge: float = 0.5
     min_sightings: int = 6
-    min_ratio: float = 0.2
+    min_ratio: float = 0.15
     passed: float = 0.1
     usual_score: float = 0.25
     min_share: float = 0.03

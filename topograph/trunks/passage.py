@@ -72,6 +72,19 @@ def ring_image(p, r, starts, eye):
 
 
 @njit(cache=True)
+def _towards(b):
+    """A vector in the direction of (broken) bin `b`: back from the diamond angle."""
+    t = 4.0 * b / BINS
+    if t < 1:
+        return 1.0 - t, t
+    if t < 2:
+        return 1.0 - t, 2.0 - t
+    if t < 3:
+        return t - 3.0, 2.0 - t
+    return t - 3.0, t - 4.0
+
+
+@njit(cache=True)
 def _cells(first, last):
     """A word with the bits of the cells from `first` up to before `last`, m."""
     i0, i1 = max(int(first), 0), min(int(np.floor(last)), CELLS)
@@ -96,15 +109,7 @@ def passage(near, slope, eye, plane, grid):
     high = eye[2] - under
     full = np.uint32(0xFFFFFFFF)
     for b in range(BINS):
-        t = 4.0 * (b + 0.5) / BINS  # back from the diamond angle
-        if t < 1:
-            dx, dy = 1 - t, t
-        elif t < 2:
-            dx, dy = 1 - t, 2 - t
-        elif t < 3:
-            dx, dy = t - 3, 2 - t
-        else:
-            dx, dy = t - 3, t - 4
+        dx, dy = _towards(b + 0.5)
         n = np.sqrt(dx * dx + dy * dy)
         fall = (plane[1] * dx + plane[2] * dy) / n
         for k in range(rings):
@@ -133,15 +138,7 @@ def passage(near, slope, eye, plane, grid):
         if not known[b]:
             continue
         for e in range(2):  # a bin's two edges may lie in two sectors
-            t = 4.0 * (b + 0.05 + 0.9 * e) / BINS
-            if t < 1:
-                dx, dy = 1 - t, t
-            elif t < 2:
-                dx, dy = 1 - t, 2 - t
-            elif t < 3:
-                dx, dy = t - 3, 2 - t
-            else:
-                dx, dy = t - 3, t - 4
+            dx, dy = _towards(b + 0.05 + 0.9 * e)
             k = int((np.arctan2(dy, dx) + np.pi) * (SECTORS / (2 * np.pi))) % SECTORS
             out[k] &= free[b] & ~met[b]
             some[k] = True
@@ -210,13 +207,12 @@ def look_at(near, tangent, R, eye, x, y, z, lx, ly, ground, radius, highest, out
             elif through:
                 out[AXIS_PASS] += 1  # no return upwards is the sky
             wide = min(int(1.0 / max(width, 1e-3)), 60)
-            every = 1 + wide // 6  # a sample is enough for a share
-            for q in range(-wide, wide + 1, every):
+            for q in range(-wide, wide + 1):
                 v = near[k, (b + q) % BINS]
                 if v == 0 or v > d - 1.0:
-                    out[CROWN_SEEN] += every
+                    out[CROWN_SEEN] += 1
                     if v > 0 and v < d + 1.0:
-                        out[CROWN_HIT] += every
+                        out[CROWN_HIT] += 1
         if h > highest + 0.05 and tops < 2 and h < 3.5 and not blocked:
             tops += 1
             above += -1.0 if met else (1.0 if through else 0.0)

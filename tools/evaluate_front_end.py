@@ -16,14 +16,14 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from recordings import map_at
 
 from topograph.bags import Recording, Scan, Trunks
 from topograph.config import Config
 from topograph.evaluate import Truth, trunk_metrics
 from topograph.evaluate.metrics import match
 from topograph.geometry import interpolate, inverse, transform
-from topograph.motion import Motion, StreamsBuilder, twist_during
-from topograph.trees import Detections, exists, follow, refine, tabulate
+from topograph.motion import StreamsBuilder, twist_during
 from topograph.trunks.detector import Detector
 from topograph.trunks.thesis import ThesisDetector
 
@@ -77,7 +77,7 @@ def run(bag: Path, every: int, front_end: str, shuffle: bool, no_time: bool) -> 
             twist, _ = twist_during(s.stamp_ns - 100_000_000, s.stamp_ns, builder.odometry, builder.imu, imu)
             trunks.append(detect(s, twist))
     stamps = np.array([t.stamp_ns for t in trunks])
-    _, table = trunk_metrics(truth, stamps, [t.p for t in trunks], edges=EDGES)
+    _, table = trunk_metrics(truth, stamps, [t.p[t.score >= 0] for t in trunks], edges=EDGES)
     return Result(bag.stem, table, nees_of(truth, trunks), *mapped(truth, trunks, config))
 
 
@@ -99,26 +99,14 @@ def nees_of(truth: Truth, trunks: list[Trunks]) -> np.ndarray:
 def mapped(truth: Truth, trunks: list[Trunks], config: Config):
     """Trees found, right, there; errors (M, 2) and diameter errors (M,), with the true poses as the path."""
     poses = interpolate(truth.stamps_ns, truth.world_T_robot, np.array([t.stamp_ns for t in trunks]))
-    d = Detections.of(trunks)
-    distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
-    motion = Motion(d.stamps_ns, poses, distance, np.zeros(len(distance)), True, True)
-    track = follow(d, motion, config.trees)
-    seen = transform(poses[d.scan], d.p)
-    variance = 0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1])
-    t = tabulate(seen[:, :2], variance, track, distance[d.scan])
-    tree = refine(t.place, t.sigma, t.hits, np.arange(len(t.hits)), config.trees)[track]
-    n = int(tree.max(initial=-1)) + 1
-    weight = 1.0 / variance
-    total = np.bincount(tree, weight, n)
-    place = np.stack([np.bincount(tree, weight * seen[:, k], n) / total for k in range(3)], axis=1)
-    ok, *_ = exists(d, tree, poses, place, config.trees)
+    m = map_at(poses, trunks, config)
+    trees = m.kind == 0
     shown = truth.returns.sum(axis=0) >= 200
-    at = truth.trees + truth.axes * (0.8 / truth.axes[:, 2:])
-    i, j = match(place[ok][:, :2], at[:, :2])
-    rows = np.flatnonzero(ok)[i]
-    diameter = np.array([np.median(d.diameter[tree == k]) for k in rows])
-    error = place[rows][:, :2] - at[j, :2]
-    return int(ok.sum()), len(i), int(np.isin(np.flatnonzero(shown), j).sum()) + 10000 * int(shown.sum()), error, diameter - truth.diameters[j], error - error.mean(0)  # fmt: skip
+    height = m.height[trees][:, None]
+    i, j = match(m.p[trees, :2], (truth.trees + truth.axes * (0.8 / truth.axes[:, 2:]))[:, :2])
+    at = truth.trees[j, :2] + truth.axes[j, :2] / truth.axes[j, 2:] * height[i]
+    error = m.p[trees][i, :2] - at
+    return int(trees.sum()), len(i), int(np.isin(np.flatnonzero(shown), j).sum()) + 10000 * int(shown.sum()), error, m.diameter[trees][i] - truth.diameters[j], error - error.mean(0)  # fmt: skip
 
 
 def main() -> None:

@@ -14,6 +14,7 @@ from topograph.geometry import Array, from_xyz_rpy, inverse, transform
 from topograph.simulate import DESIGNS, OrchardConfig, SensorConfig
 from topograph.simulate.lidar import Sweep, sweep
 from topograph.simulate.orchard import Orchard, plant
+from topograph.simulate.sensors import mounting
 
 HDL64 = tuple(np.radians(np.r_[np.linspace(2.0, -8.33, 32), np.linspace(-8.83, -24.33, 32)]))
 SENSORS = {
@@ -162,8 +163,6 @@ def _look(scene: Orchard, sensor: SensorConfig, seed: int, rng: np.random.Genera
     z = {d: float(g.at(xy + np.array(d))) for d in [(0.3 * c, 0.3 * s), (-0.3 * c, -0.3 * s), (-0.3 * s, 0.3 * c), (0.3 * s, -0.3 * c)]}  # fmt: skip
     front, back, left, right = z.values()
     world_T_base = from_xyz_rpy(*xy, np.mean([front, back, left, right]), np.arctan2(left - right, 0.6), -np.arctan2(front - back, 0.6), yaw)  # fmt: skip
-    from topograph.simulate.sensors import mounting
-
     base_T_lidar = mounting(sensor)
     moving = rng.random() < 0.7
     twist = np.array([rng.uniform(0, 1.5), 0, 0, 0, 0, rng.normal(0, 0.2)]) * moving

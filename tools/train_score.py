@@ -23,6 +23,7 @@ from scipy.spatial import cKDTree
 
 from topograph.geometry import Array
 from topograph.simulate.growth import POST, TRUNK
+from topograph.trees.existence import KIND_PRIOR
 from topograph.trunks import fit as F
 from topograph.trunks.config import TrunksConfig
 from topograph.trunks.detector import candidates
@@ -219,7 +220,7 @@ def main() -> None:
     Z[np.ix_(blind, overhead)] = 0.0
     mean, deviation = Z.mean(0), Z.std(0) + 1e-6
     # What stands in a scene differs more between scenes than a prior could know; posts are fewer than trees.
-    share = np.array([0.45, 0.1, 0.45])
+    share = np.exp(KIND_PRIOR)
     weight = (share / np.bincount(y, minlength=3))[y]
     Zr, yr, wr = recorded(a.recorded, share)
     Zr[np.ix_(rng.random(len(Zr)) < DROPPED, overhead)] = 0.0

@@ -12,9 +12,9 @@ from topograph.estimate import Estimate
 from topograph.geometry import Array, Datum
 from topograph.topomap.clouds import register
 from topograph.topomap.edges import TopomapConfig, among
-from topograph.topomap.map import TopoMap, Viewpoint
+from topograph.topomap.map import TREE, TopoMap, Viewpoint
 from topograph.topomap.rows import find_rows
-from topograph.trees import TREE, Detections, Existence, shapes
+from topograph.trees import Detections, Existence, shapes
 
 
 def build(

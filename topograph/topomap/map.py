@@ -8,6 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from topograph.geometry import Array, Datum, Stamps
+from topograph.trunks.score import KINDS, OTHER, TREE
+
+__all__ = ["KINDS", "OTHER", "TREE", "TopoMap", "Viewpoint"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,11 +23,6 @@ class Viewpoint:
     tree: int
     direction: Array
     cloud: NDArray[np.float32]
-
-
-KINDS = ("tree", "post", "other")
-"""What a landmark can be."""
-TREE, POST, OTHER = range(3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

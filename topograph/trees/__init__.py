@@ -1,7 +1,7 @@
 """Trunks + a predicted path -> which trunks are one tree: tracking, loop closing, births and deaths."""
 
 from topograph.trees.detections import Detections, in_order
-from topograph.trees.existence import OTHER, POST, TREE, Existence, exists
+from topograph.trees.existence import Existence, exists
 from topograph.trees.keyframes import choose_keyframes
 from topograph.trees.loops import LoopCloser, TrackTable, moved_pose, tabulate
 from topograph.trees.refine import refine
@@ -11,9 +11,6 @@ from topograph.trees.sightings import Sightings, gather
 from topograph.trees.tracks import TreesConfig, follow
 
 __all__ = [
-    "OTHER",
-    "POST",
-    "TREE",
     "Detections",
     "Existence",
     "LoopCloser",

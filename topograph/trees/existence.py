@@ -12,8 +12,8 @@ from topograph.geometry import Array, inverse, transform
 from topograph.trees.detections import SECTORS, Detections
 from topograph.trees.screen import parts_apart
 from topograph.trees.tracks import TreesConfig
+from topograph.trunks.score import OTHER, TREE
 
-TREE, POST, OTHER = range(3)
 KIND_PRIOR = np.log(np.array([0.45, 0.1, 0.45]))
 """Shares of the kinds that the score was trained with."""
 FRESH = 0.25

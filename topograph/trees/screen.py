@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from topograph.geometry import Array, transform
 from topograph.motion import Motion
 from topograph.trees.detections import Detections
+from topograph.trunks.score import column_odds
 
 DRIFT = 0.05
 """Share of the distance driven that dead reckoning may put a still thing off while it is followed."""
@@ -49,20 +50,13 @@ def screen(detections: Detections, track: NDArray[np.int64], motion: Motion) -> 
     # Where fixes stand in for wheels, what seems to move may be the robot.
     moving = _moving(d, track, n, motion) if motion.wheels else np.zeros(n, bool)
     doubted = np.zeros(n, bool)
-    odds = column_odds(d.kinds)
-    told = np.isfinite(odds)
+    told = np.isfinite(d.kinds).all(axis=1)
     if told.any():
         count = np.bincount(track[told], minlength=n)
-        mean = np.bincount(track[told], odds[told], minlength=n) / np.maximum(count, 1)
+        mean = np.bincount(track[told], column_odds(d.kinds[told]), minlength=n) / np.maximum(count, 1)
         doubted = (count > 0) & (mean < DOUBT)
     hits = np.bincount(track, minlength=n)
     return Screened(~(moving | doubted)[track], int(moving.sum()), int((doubted & ~moving & (hits > 2)).sum()))
-
-
-def column_odds(kinds: Array) -> Array:
-    """Log-odds (N,) of tree or post against all else; NaN where unknown."""
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.logaddexp(kinds[:, 0], kinds[:, 1]) - kinds[:, 2])
 
 
 def _moving(d: Detections, track: NDArray[np.int64], n: int, motion: Motion) -> NDArray[np.bool_]:

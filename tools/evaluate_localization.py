@@ -171,7 +171,7 @@ def thesis_start(seed: int, c: StartsConfig, length: float) -> Start:
             np.full(m, np.nan), np.tile(0.01 * np.eye(3), (m, 1, 1)), np.full(m, 0.8), np.ones(m),
         )  # fmt: skip
         began = time.perf_counter()
-        report = method.step(trunks, Leg(s.motion, 0, 0, 0, s.distance, abs(s.motion[2]), 0.5, True, True, True))
+        report = method.step(trunks, Leg(step=s.motion, distance=s.distance, turned=abs(s.motion[2]), seconds=0.5))
         ms.append(1e3 * (time.perf_counter() - began))
         if report.fix is not None:
             e = float(np.hypot(*(report.fix.map_T_robot[:2, 3] - s.pose[:2])))

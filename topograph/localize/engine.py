@@ -16,6 +16,8 @@ from topograph.localize.index import MapIndex
 from topograph.localize.search import Found, search
 from topograph.localize.submap import BINS, Move, Submap, Sweep, Visibility, absorb, assign, in_reach, in_view, sectors
 
+ASTRAY = 0.3
+"""Deviation of a tree's place in the middle of the view, in mean spacings of trees, beyond which it is searched anew."""
 OVERRULE = 0.01
 """Share of the risk at which the shadow may overrule a track: it is asked every metre, and the track was sure as well."""
 NO_PAIRS = np.zeros((0, 2), np.int64)
@@ -85,7 +87,11 @@ class Engine:
                 return self._belief(self._pairs(self._commit(), sweep))
             self._restart_when_stale()
             return self._belief(NO_PAIRS)
-        pairs = self._follow(self.track, move, sweep)
+        self.track.predict(move.step, move.cov, move.distance)
+        if self._astray(self.track):
+            self._lose(sweep)
+            return self._belief(NO_PAIRS)
+        pairs = self._follow(self.track, sweep)
         self._shadow()
         if self.sums[0] > self.config.lost or self.sums[1] > self.config.slip:
             self._lose(sweep)
@@ -94,15 +100,15 @@ class Engine:
 
     # -- searching ------------------------------------------------------------------------------------------------
 
-    def _look(self) -> None:
-        """Search, or weigh anew what was found, as the submap grows."""
+    def _look(self) -> bool:
+        """Search, or weigh anew what was found, as the submap grows; whether the posterior is of the submap as it is now."""
         h, c = self.hunt, self.config
         f = h.submap.filter
         if f.n < 2:
-            return
+            return False
         key = (f.run, f.n)
         if f.run - h.weighed[0] < 0.25 and f.n <= h.weighed[1] and h.submap.scans % 5:
-            return
+            return False
         h.weighed = key
         marks, rows = describe(h.submap, self.index, c)
         s2 = self.index.jitter**2
@@ -112,16 +118,17 @@ class Engine:
             bits[ok] += 0.5 * np.log1p(self.index.diameter_sd**2 / marks.diameter_var[ok]) * marks.lasting[ok]
         need = c.information * np.log(4.0 * len(self.index) / c.risk)
         if float(bits.sum()) < need and (len(marks) < 10 or f.run - h.searched < 2 * c.again):
-            return  # too little to decide; where planting is regular, the places that are left are still counted
+            return False  # too little to decide; where planting is regular, the places that are left are still counted
         h.informed = True
         small = len(self.index.length) < 10000
         if not small and h.found is not None and f.run - h.searched < c.again:
             h.posterior, h.rows = weigh(self._kept(h), marks, h.submap, self.index, c), rows
             if h.posterior.risk > c.risk:
-                return
+                return True
         h.found = search(marks, self.index, c)
         h.searched = f.run
         h.posterior, h.rows = weigh(h.found, marks, h.submap, self.index, c), rows
+        return True
 
     @staticmethod
     def _kept(h: _Hunt) -> Found:
@@ -147,10 +154,15 @@ class Engine:
 
     # -- tracking -------------------------------------------------------------------------------------------------
 
-    def _follow(self, f: Filter, move: Move, sweep: Sweep) -> NDArray[np.int64]:
+    def _astray(self, f: Filter) -> bool:
+        """Dead reckoning has gone so far without trees that the nearest tree need not be the right one."""
+        across = f.cov[2, 2] * (0.5 * self.config.view) ** 2
+        spread = np.sqrt(max(f.cov[0, 0], f.cov[1, 1]) + across)
+        return bool(spread > ASTRAY / np.sqrt(self.index.density))
+
+    def _follow(self, f: Filter, sweep: Sweep) -> NDArray[np.int64]:
         """One scan of tracking; the pairs of trunks and mapped trees."""
         c = self.config
-        f.predict(move.step, move.cov, move.distance)
         used, rows = in_reach(sweep, c)
         z = used.p
         self._bring_in(f)
@@ -239,10 +251,10 @@ class Engine:
         h, c = self.hunt, self.config
         f = h.submap.filter
         if f.run - h.searched >= 1.0 or f.run >= c.shadow:
-            self._look()
+            renewed = self._look()  # an older posterior speaks of landmarks that may have been dropped since
             h.searched = f.run
             p = h.posterior
-            if len(p.pose) and p.risk <= OVERRULE * c.risk and self.track is not None:
+            if renewed and len(p.pose) and p.risk <= OVERRULE * c.risk and self.track is not None:
                 other = anchored(h, self.index, c)
                 apart = np.hypot(*(other.mean[:2] - self.track.mean[:2]))
                 turn = abs((other.mean[2] - self.track.mean[2] + np.pi) % (2 * np.pi) - np.pi)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from topograph.bags import Imu, Odometry, Scan, Trunks
 from topograph.errors import InsufficientDataError
-from topograph.geometry import Array, from_xyz_rpy, transform
+from topograph.geometry import Array, from_xyz_rpy, transform, yaw_of
 from topograph.localize.config import LocalizeConfig
 from topograph.localize.engine import Belief, Engine
 from topograph.localize.index import build_index
@@ -19,6 +19,9 @@ from topograph.localize.submap import Move, Sweep
 from topograph.motion import Leg, Reckoner, twist_during, up_at
 from topograph.topomap import TopoMap
 from topograph.trunks import smeared
+
+HEADING_FLOOR = 0.004
+"""Least deviation of a heading from trees for learning the gyro's bias, rad: its errors last over many scans."""
 
 Detect = Callable[[Scan, Array, Array | None], Trunks]
 
@@ -78,7 +81,10 @@ class Localizer:
         del self._recent_odometry[:-200], self._recent_imu[:-500]
         self.leg = self.reckoner.advance(scan.stamp_ns)
         self.report = self.method.step(scan, self.leg)
-        return self.report.fix
+        fix = self.report.fix
+        if fix is not None and np.isfinite(fix.cov[2, 2]):
+            self.reckoner.hold(float(yaw_of(fix.map_T_robot)), max(float(np.sqrt(fix.cov[2, 2])), HEADING_FLOOR))
+        return fix
 
 
 class GraphMethod:
@@ -192,14 +198,15 @@ def move_of(leg: Leg, config: LocalizeConfig) -> Move:
     c = config
     along = c.along * leg.distance + (c.step if leg.distance > 1e-4 else 1e-4)
     across = c.across * leg.distance + (c.step if leg.distance > 1e-4 else 1e-4)
-    if not leg.wheels:
-        along = across = 0.5 * leg.seconds + 0.05
+    if leg.blind > 0:  # a robot drives at a walking pace
+        along = across = float(np.hypot(along, 0.5 * leg.blind + 0.05))
     if leg.gyro:
         yaw = np.hypot(c.yaw_gyro * leg.turned, c.yaw_rate * np.sqrt(max(leg.seconds, 0.0)))
+        yaw = np.hypot(yaw, leg.rate_sigma * leg.seconds)
     else:
         yaw = np.hypot(c.yaw_wheels * leg.turned, c.yaw_distance * np.sqrt(leg.distance))
-    if not leg.wheels and not leg.gyro:
-        yaw = 0.3 * leg.seconds + 0.02
+    if leg.blind > 0 and not leg.gyro:
+        yaw = float(np.hypot(yaw, 0.3 * leg.blind + 0.02))
     return Move(leg.step, np.diag([along**2, across**2, yaw**2 + 1e-8]), leg.distance)
 
 

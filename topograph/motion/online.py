@@ -5,41 +5,84 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from topograph.bags import Imu, Odometry
 from topograph.geometry import Array, exp, from_quaternion, inverse, log
 from topograph.motion.inertial import GRAVITY
 from topograph.motion.reckon import _filter, _quaternion_of
 
+JUMP = (15.0, 0.5)
+"""A step longer than so many m/s and m is a reset of the odometry."""
+CARRY_NS = 100_000_000
+"""Where no message has come yet, the last step's velocity holds so long (or one and a half periods of the wheels)."""
+GAP_NS = 300_000_000
+"""Wheels silent for longer (or for three periods) do not cover the time, and what they say of it later is not used."""
+GYRO_GAP_NS = 200_000_000
+"""The same of the gyro: a rate says nothing of what comes so much later."""
+REST = (0.005, 0.001)
+"""Slower than so many m/s and rad/s between two messages of the wheels is standing."""
+SETTLE_NS = 200_000_000
+"""The frame still rocks after the wheels have stopped."""
+BIAS_SIGMA = 0.02
+"""What a gyro's bias may be before anything is known, rad/s: consumer MEMS."""
+USUAL_BIAS = 0.005
+"""What it mostly is, rad/s."""
+BIAS_WALK = 1e-4
+"""rad/s per √s."""
+BIAS_NOISE = 1e-3
+"""Noise of a mean rate at rest, rad/s per √Hz: a running engine shakes."""
+HALF_TURN = 3.0
+HEADING_WALK = 1e-3
+"""How far gyro and map may part by noise alone, rad/√s."""
+LEVEL_SIGMA = 0.01
+"""Roll and pitch as gravity holds them over time, rad."""
+MOVING_SIGMA = 0.06
+"""The same from less than a second of a drive, rad: the suspension's own accelerations."""
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Leg:
     """Motion of the base between two stamps.
 
     Attributes:
         step: (3,) x, y (m) and yaw (rad) in the levelled frame of the first pose; `up` m.
-        roll, pitch: of the base at the second stamp, rad; zero without an IMU.
+        roll, pitch: of the base at the second stamp, rad; zero without an IMU; `tilt_sigma` their deviation.
         distance, turned: m, rad, as driven.
-        seconds: between the stamps.
+        seconds: between the stamps; `blind` of them that no wheels cover.
+        rate_sigma: of the gyro's bias, rad/s: unlike noise it does not average out within the leg.
         gyro, level: the turn is the gyro's; roll and pitch are held to gravity.
-        wheels: odometry came in at all.
     """
 
     step: Array
-    up: float
-    roll: float
-    pitch: float
+    up: float = 0.0
+    roll: float = 0.0
+    pitch: float = 0.0
+    tilt_sigma: float = LEVEL_SIGMA
     distance: float
     turned: float
     seconds: float
-    gyro: bool
-    level: bool
-    wheels: bool
+    blind: float = 0.0
+    rate_sigma: float = 0.0
+    gyro: bool = True
+    level: bool = True
+
+
+@dataclass(slots=True)
+class _Attitude:
+    """The gyro's rotation at a stamp, with roll and pitch held to gravity."""
+
+    ns: int
+    q: Array
+    age: float
+    sigma: float
 
 
 class Reckoner:
     """Feed it odometry and IMU messages as they come; `advance` gives the motion up to a stamp.
 
+    How often it is asked makes no difference: attitude and wheels are joined message by message.
     `child_T_robot` (4, 4) takes odometry's child frame to the base; `robot_R_imu` (3, 3) turns IMU samples into the base's
     axes, None: the tilt is taken from gravity at the start, which is enough for turns.
     """
@@ -50,137 +93,276 @@ class Reckoner:
         self.child_T_robot = np.eye(4) if child_T_robot is None else child_T_robot
         self.robot_R_imu = robot_R_imu
         self.tilt_time_s = tilt_time_s
-        self._wheels: list[tuple[int, Array]] = []
-        self._imu: list[tuple[int, Array, Array]] = []
-        self._q: Array | None = None
-        self._q_ns = 0
-        self._R = np.eye(3)
-        self._yaw = 0.0
-        self._last: tuple[int, Array] | None = None
-        self._speed = 0.0
-        self._bias = np.zeros(3)
-        self._still = 0
+        self.bias = np.zeros(3)
+        self._wheels: list[tuple[int, Array]] = []  # poses not yet passed
+        self._imu: list[tuple[int, Array, Array]] = []  # samples not yet integrated
+        self._resting: list[tuple[int, Array]] = []  # rates since the last wheel message that was passed
+        self._rest_since: int | None = None
+        self._speeds: list[tuple[int, float]] = []  # of the last second, at the middle of each step
+        self._last: tuple[int, Array] | None = None  # the wheels' pose up to which motion has been told
+        self._velocity: Array | None = None  # (6,) per second, of the last step
+        self._heard: tuple[int, Array] | None = None  # the last message of the wheels that was passed
+        self._period_ns = 0  # of these messages
+        self._attitude: _Attitude | None = None
+        self._unit = 1.0
+        self._told, self._held_ns = 0.0, 0  # the gyro's heading so far, and the stamp of the last heading from outside
+        self._drift, self._drift_cov = np.zeros(2), np.diag([HALF_TURN**2, BIAS_SIGMA**2])  # rad and rad/s
+        self._sample: tuple[int, Array, Array] | None = None  # the last one integrated
         self._at_ns: int | None = None
-        self._scale = 1.0
 
     def add(self, message: Odometry | Imu) -> None:
-        """One message; stamps rise within each kind."""
+        """One message; stamps rise within each kind. What is not finite is passed over."""
         if isinstance(message, Imu):
             if np.isfinite(message.gyro).all() and np.isfinite(message.accel).all():
                 self._imu.append((message.stamp_ns, message.gyro, message.accel))
-        elif np.isfinite(message.odom_T_child).all():
+        elif np.isfinite(message.odom_T_child).all() and np.linalg.norm(message.odom_T_child[3:]) > 0.5:
             pose = from_quaternion(message.odom_T_child[:3], message.odom_T_child[3:])
             self._wheels.append((message.stamp_ns, pose @ self.child_T_robot))
 
     def advance(self, stamp_ns: int) -> Leg:
-        """Motion since the last call, with all messages up to `stamp_ns`."""
+        """Motion since the last call, with all messages up to `stamp_ns`; nothing moves when the stamp does not rise."""
         first = self._at_ns is None
-        seconds = 0.0 if first or self._at_ns is None else (stamp_ns - self._at_ns) * 1e-9
+        begin_ns = stamp_ns if self._at_ns is None else self._at_ns
+        stamp_ns = max(stamp_ns, begin_ns)
         self._at_ns = stamp_ns
-        yaw_before = self._yaw
-        gyro = self._turn(stamp_ns)
-        steps = [w for w in self._wheels if w[0] <= stamp_ns]
-        ahead = [w for w in self._wheels if w[0] > stamp_ns]
-        poses = list(steps)
-        if ahead and (poses or self._last is not None):  # part of the step that reaches beyond the stamp
-            before = poses[-1] if poses else self._last
-            assert before is not None
-            share = (stamp_ns - before[0]) / max(ahead[0][0] - before[0], 1)
-            poses.append((stamp_ns, before[1] @ exp(share * log(inverse(before[1]) @ ahead[0][1]))))
-        self._wheels = ahead
-        planar, up, distance, turned = np.zeros(3), 0.0, 0.0, 0.0
-        yaw_rate = 0.0 if seconds <= 0 else (self._yaw - yaw_before) / max(seconds, 1e-3)
-        heading = 0.0
-        for ns, pose in poses:
-            if self._last is None:
-                self._last = (ns, pose)
-                continue
-            dt = (ns - self._last[0]) * 1e-9
-            move = inverse(self._last[1]) @ pose
-            self._last = (ns, pose)
-            length = float(np.linalg.norm(move[:3, 3]))
-            if length > 15.0 * max(dt, 0.02) + 0.5:
-                continue  # a reset of the odometry
-            turn = yaw_rate * dt if gyro else float(np.arctan2(move[1, 0], move[0, 0]))
-            wheel_turn = float(np.arctan2(move[1, 0], move[0, 0]))
-            local = exp(0.5 * log(move))[:3, :3].T @ move[:3, 3]
-            world = self._R @ local if gyro else local
-            flat = world[:2] if gyro else local[:2]
-            if gyro:  # into the levelled frame of the robot's present heading
-                c, s = np.cos(self._yaw), np.sin(self._yaw)
-                flat = np.array([c * world[0] + s * world[1], -s * world[0] + c * world[1]])
-            up += float(world[2])
-            middle = heading + 0.5 * turn
-            c, s = np.cos(middle), np.sin(middle)
-            planar[:2] += [c * flat[0] - s * flat[1], s * flat[0] + c * flat[1]]
-            heading += turn
-            distance += length
-            turned += abs(turn)
-            if dt > 1e-4:
-                self._speed += 0.5 * (np.sign(move[0, 3]) * length / dt - self._speed)
-                still = length / dt < 0.005 and abs(wheel_turn) / dt < 0.003
-                self._still = self._still + 1 if still else 0
-        planar[2] = self._yaw - yaw_before if gyro else heading
-        if gyro:
-            turned = max(turned, abs(float(planar[2])))
-        roll, pitch = 0.0, 0.0
-        if self._q is not None:
-            roll = float(np.arctan2(self._R[2, 1], self._R[2, 2]))
-            pitch = float(np.arcsin(np.clip(-self._R[2, 0], -1, 1)))
+        seconds = (stamp_ns - begin_ns) * 1e-9
+        steps, blind = self._steps(begin_ns, stamp_ns)
+        times, rotations, gyro = self._turn(stamp_ns)
+        if first:  # what came before the first scan only says how the robot stands and moves
+            steps, blind, gyro = [], 0.0, False
+        tilt = {}
+        if self._attitude is not None:
+            R = rotations[-1]
+            tilt = {
+                "roll": float(np.arctan2(R[2, 1], R[2, 2])),
+                "pitch": float(np.arcsin(np.clip(-R[2, 0], -1, 1))),
+                "tilt_sigma": self._attitude.sigma,
+            }
+        step, up, distance, turned = _along_gyro(steps, times, rotations) if gyro else _along_wheels(steps)
+        self._told += float(step[2])
+        if not gyro:
+            self._drift_cov[:] = np.diag([HALF_TURN**2, self._drift_cov[1, 1]])
         return Leg(
-            planar, up, roll, pitch, distance, turned, seconds, gyro, self._q is not None, self._last is not None
+            step=step, up=up, distance=distance, turned=turned, seconds=seconds, blind=blind, gyro=gyro,
+            rate_sigma=min(float(np.sqrt(self._drift_cov[1, 1])), USUAL_BIAS), level=self._attitude is not None, **tilt,
         )  # fmt: skip
 
-    def _turn(self, stamp_ns: int) -> bool:
-        """Bring the attitude to a stamp; whether the gyro covers it."""
-        ready = [m for m in self._imu if m[0] <= stamp_ns]
-        self._imu = [m for m in self._imu if m[0] > stamp_ns]
-        if not ready:
-            return self._q is not None and stamp_ns - self._q_ns < 200_000_000
-        if self._q is None:
-            if len(ready) < 3:
-                self._imu = ready + self._imu
-                return False
-            mean = np.mean([a for _, _, a in ready], axis=0)
-            size = float(np.linalg.norm(mean))
-            self._scale = GRAVITY if 0.8 < size < 1.2 else 1.0  # some drivers report g
-            if self.robot_R_imu is None:
-                self.robot_R_imu = _upright(mean / max(size, 1e-6))
-            force = self.robot_R_imu @ mean
-            self._q = _quaternion_of(
-                float(np.arctan2(force[1], force[2])), float(np.arctan2(-force[0], np.hypot(force[1], force[2])))
-            )
-            self._q_ns = ready[0][0]
-        R = self.robot_R_imu
-        assert R is not None
-        rate = np.array([g for _, g, _ in ready]) @ R.T
-        force = np.array([a for _, _, a in ready]) @ R.T * self._scale
-        if self._still >= 5:  # the wheels stand still: what the gyro says is bias
-            gain = min(1.0, 0.05 * len(rate) / 10)
-            self._bias += gain * (rate.mean(0) - self._bias)
-        rate = rate - self._bias
-        force[:, 1] -= self._speed * rate[:, 2]
-        stamps = np.array([s for s, _, _ in ready])
-        dt = np.diff(np.concatenate([[self._q_ns], stamps])).clip(0, 200_000_000) * 1e-9
-        rates = np.concatenate([rate[:1], rate])
-        forces = np.concatenate([force[:1], force])
-        q = _filter(self._q, rates, forces, dt, self.tilt_time_s, GRAVITY)
-        self._q, self._q_ns = q[-1], int(stamps[-1])
-        poses = from_quaternion(np.zeros((len(q), 3)), q)[:, :3, :3]
-        yaw = np.unwrap(np.arctan2(poses[:, 1, 0], poses[:, 0, 0]))
-        self._yaw += float(yaw[-1] - yaw[0])
-        self._R = poses[-1]
-        # The filter's own yaw and the sum of its steps agree up to full turns; rotations use the filter's.
-        self._yaw = float(yaw[-1] + 2 * np.pi * np.round((self._yaw - yaw[-1]) / (2 * np.pi)))
+    def hold(self, yaw: float, sigma: float) -> None:
+        """The heading at the last stamp as a map has it, rad: what the gyro steadily drifts away from it is bias.
+
+        A Kalman filter over the offset of the two headings and its rate; a robot that never stands learns its bias so.
+        """
+        if self._attitude is None or self._at_ns is None:
+            return
+        dt = (self._at_ns - self._held_ns) * 1e-9 if self._held_ns else 0.0
+        self._held_ns = self._at_ns
+        F = np.array([[1.0, dt], [0.0, 1.0]])
+        P = F @ self._drift_cov @ F.T + np.diag([HEADING_WALK**2, BIAS_WALK**2]) * dt
+        x = F @ self._drift
+        off = (yaw - self._told - x[0] + np.pi) % (2 * np.pi) - np.pi
+        S = P[0, 0] + sigma**2
+        if off**2 > 25.0 * S:  # found again elsewhere
+            x[0], P = x[0] + off, np.diag([sigma**2, P[1, 1]])
+        else:
+            K = P[:, 0] / S
+            x, P = x + K * off, P - np.outer(K, P[0])
+        self.bias[2] -= x[1]
+        self._drift, self._drift_cov = np.array([x[0], 0.0]), P
+
+    # -- wheels ---------------------------------------------------------------------------------------------------
+
+    def _steps(self, begin_ns: int, stamp_ns: int) -> tuple[list[tuple[int, int, Array]], float]:
+        """Steps (from, to, motion (4, 4)) of the wheels between the stamps, and the seconds that they do not cover."""
+        carry, gap = max(CARRY_NS, 3 * self._period_ns // 2), max(GAP_NS, 3 * self._period_ns)
+        passed = [w for w in self._wheels if w[0] <= stamp_ns]
+        self._wheels = [w for w in self._wheels if w[0] > stamp_ns]
+        steps: list[tuple[int, int, Array]] = []
+        for heard in passed:
+            if self._heard is None or self._last is None or not self._joined(self._heard, heard, gap, begin_ns):
+                self._velocity = None
+            else:
+                steps.append((self._last[0], heard[0], inverse(self._last[1]) @ heard[1]))
+            self._last = self._heard = heard
+        if self._last is not None and self._heard is not None and stamp_ns > self._last[0]:
+            last_ns, pose = self._last
+            move = None
+            if self._wheels:
+                ahead_ns, ahead = self._wheels[0]
+                if ahead_ns - self._heard[0] <= gap:
+                    move = exp((stamp_ns - last_ns) / (ahead_ns - last_ns) * log(inverse(pose) @ ahead))
+            elif self._velocity is not None and stamp_ns - self._heard[0] <= carry:
+                move = exp(self._velocity * (stamp_ns - last_ns) * 1e-9)
+            if move is not None and not _is_jump(move, (stamp_ns - last_ns) * 1e-9):
+                steps.append((last_ns, stamp_ns, move))
+                self._last = (stamp_ns, pose @ move)
+        covered = sum(max(b - max(a, begin_ns), 0) for a, b, _ in steps) * 1e-9
+        blind = (stamp_ns - begin_ns) * 1e-9 - covered
+        return steps, blind if blind > 0.02 else 0.0
+
+    def _joined(self, heard: tuple[int, Array], now: tuple[int, Array], gap_ns: int, begin_ns: int) -> bool:
+        """Take in one message of the wheels; False where it does not go on from the last one: a reset of the odometry, or
+        a gap of which a part has been told already."""
+        assert self._last is not None
+        dt_ns = now[0] - heard[0]
+        if dt_ns <= 0:
+            return False
+        move = inverse(heard[1]) @ now[1]
+        dt = dt_ns * 1e-9
+        usual = self._period_ns or dt_ns
+        self._period_ns = usual + (min(dt_ns, 4 * usual) - usual) // 10
+        if _is_jump(move, dt) or (dt_ns > gap_ns and heard[0] < begin_ns):
+            return False
+        self._velocity = log(move) / dt
+        self._speeds.append((heard[0] + dt_ns // 2, float(np.sign(move[0, 3]) * np.linalg.norm(move[:3, 3])) / dt))
+        self._learn(heard[0], now[0], move)
         return True
+
+    def _learn(self, from_ns: int, to_ns: int, move: Array) -> None:
+        """What the gyro says between two messages of standing wheels is bias."""
+        dt = (to_ns - from_ns) * 1e-9
+        still = 0 < dt < 0.5 and float(np.linalg.norm(move[:3, 3])) < REST[0] * dt
+        still = still and abs(float(np.arctan2(move[1, 0], move[0, 0]))) < REST[1] * dt
+        if not still:
+            self._rest_since = None
+            return
+        self._rest_since = from_ns if self._rest_since is None else self._rest_since
+        if from_ns < self._rest_since + SETTLE_NS or self.robot_R_imu is None:
+            return
+        rates = [g for ns, g, _ in self._imu if from_ns < ns <= to_ns]
+        rates += [g for ns, g in self._resting if from_ns < ns <= to_ns]
+        if not rates:
+            return
+        off = self.robot_R_imu @ np.mean(rates, axis=0) - self.bias
+        noise = BIAS_NOISE**2 / dt
+        P = self._drift_cov
+        P[1, 1] += BIAS_WALK**2 * dt
+        if float(np.abs(off).max()) > 4.0 * np.sqrt(P[1, 1] + noise):
+            return  # wheels that are blocked while the robot turns
+        gain = P[1, 1] / (P[1, 1] + noise)
+        self.bias = self.bias + gain * off
+        P[1] *= 1.0 - gain
+        P[:, 1] = P[1]
+        P[1, 1] = max(P[1, 1], BIAS_WALK**2)
+
+    def _drive(self, stamps_ns: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Speed and its change (N,) at stamps, as the wheels have it."""
+        if len(self._speeds) < 2:
+            return np.full(len(stamps_ns), self._speeds[0][1] if self._speeds else 0.0), np.zeros(len(stamps_ns))
+        t = np.array([ns for ns, _ in self._speeds])
+        v = np.array([speed for _, speed in self._speeds])
+        near = [np.interp(stamps_ns + shift, t, v) for shift in (-100_000_000, 100_000_000)]
+        span = np.clip(stamps_ns + 100_000_000, t[0], t[-1]) - np.clip(stamps_ns - 100_000_000, t[0], t[-1])
+        change = np.where(span > 50_000_000, (near[1] - near[0]) / np.maximum(span * 1e-9, 0.05), 0.0)
+        return np.interp(stamps_ns, t, v), change
+
+    # -- attitude -------------------------------------------------------------------------------------------------
+
+    def _turn(self, stamp_ns: int) -> tuple[NDArray[np.int64], Array, bool]:
+        """Stamps (N,) and rotations (N, 3, 3) of the attitude from the last stamp to this one, and whether the gyro covers
+        them; none where the attitude is unknown."""
+        ready = [m for m in self._imu if m[0] <= stamp_ns]
+        if self._attitude is None and not self._level(ready):
+            return np.zeros(0, np.int64), np.zeros((0, 3, 3)), False
+        a, R = self._attitude, self.robot_R_imu
+        assert a is not None and R is not None
+        ahead = [m for m in self._imu if m[0] > stamp_ns]
+        self._imu = ahead
+        used = [m for m in ready if m[0] > a.ns]
+        before = self._sample or ready[0]
+        last = used[-1] if used else before
+        end = last
+        if ahead and ahead[0][0] - last[0] <= GYRO_GAP_NS:
+            share = (stamp_ns - last[0]) / (ahead[0][0] - last[0])
+            end = (stamp_ns, last[1] + share * (ahead[0][1] - last[1]), last[2])
+        seen = np.array([before[0], *(m[0] for m in used), ahead[0][0] if ahead else stamp_ns])
+        covered = bool(np.diff(seen).max() <= GYRO_GAP_NS)
+        stamps = np.array([a.ns, *(m[0] for m in used), stamp_ns], np.int64)
+        rows = [before, *used, end]
+        rate = np.array([m[1] for m in rows]) @ R.T - self.bias
+        force = np.array([m[2] for m in rows]) @ R.T * self._unit
+        speed, change = self._drive(stamps)
+        force[:, 0] -= change
+        force[:, 1] -= speed * rate[:, 2]
+        dt = np.diff(stamps) * 1e-9
+        tau = np.clip(a.age + np.cumsum(dt), 0.5, self.tilt_time_s)
+        q = _filter(a.q, rate, force, np.minimum(dt, 1e-9 * GYRO_GAP_NS), tau, GRAVITY)
+        fade = float(np.exp(-np.sum(dt / tau)))
+        sigma = float(np.hypot(LEVEL_SIGMA, a.sigma * fade)) if covered else MOVING_SIGMA
+        self._attitude = _Attitude(stamp_ns, q[-1], a.age + float(dt.sum()), sigma)
+        self._sample = last
+        self._resting = [m[:2] for m in used[-200:]]
+        del self._speeds[:-100]
+        return stamps, from_quaternion(np.zeros((len(q), 3)), q)[:, :3, :3], covered
+
+    def _level(self, ready: list[tuple[int, Array, Array]]) -> bool:
+        """The first roll and pitch, from specific force less what the wheels explain; whether there is enough of it."""
+        if len(ready) < 3:
+            return False
+        stamps = np.array([m[0] for m in ready])
+        ready = [m for m in ready if m[0] <= stamps[0] + 1_000_000_000]
+        mean = np.mean([m[2] for m in ready], axis=0)
+        size = float(np.linalg.norm(mean))
+        self._unit = GRAVITY if 0.8 < size < 1.2 else 1.0  # some drivers report g
+        if self.robot_R_imu is None:
+            self.robot_R_imu = _upright(mean / max(size, 1e-6))
+        speed, change = self._drive(stamps[: len(ready)])
+        rate = np.array([m[1] for m in ready]) @ self.robot_R_imu.T
+        force = np.array([m[2] for m in ready]) @ self.robot_R_imu.T * self._unit
+        force[:, 0] -= change
+        force[:, 1] -= speed * rate[:, 2]
+        f = force.mean(0)
+        still = bool(np.abs(speed).max(initial=0.0) < REST[0]) and bool(np.abs(rate).max() < 0.1)
+        sigma = 2 * LEVEL_SIGMA if still else MOVING_SIGMA
+        roll, pitch = float(np.arctan2(f[1], f[2])), float(np.arctan2(-f[0], np.hypot(f[1], f[2])))
+        self._attitude = _Attitude(int(stamps[0]), _quaternion_of(roll, pitch), 0.0, sigma)
+        return True
+
+
+def _is_jump(move: Array, dt: float) -> bool:
+    return float(np.linalg.norm(move[:3, 3])) > JUMP[0] * max(dt, 0.02) + JUMP[1]
+
+
+def _along_wheels(steps: list[tuple[int, int, Array]]) -> tuple[Array, float, float, float]:
+    """Planar step (3,), rise, distance and turn of steps whose turns are the wheels'."""
+    x, distance, turned, up = np.zeros(3), 0.0, 0.0, 0.0
+    for _, _, move in steps:
+        turn = float(np.arctan2(move[1, 0], move[0, 0]))
+        c, s = np.cos(x[2]), np.sin(x[2])
+        x += [c * move[0, 3] - s * move[1, 3], s * move[0, 3] + c * move[1, 3], turn]
+        distance += float(np.linalg.norm(move[:3, 3]))
+        turned += abs(turn)
+        up += float(move[2, 3])
+    return x, up, distance, turned
+
+
+def _along_gyro(
+    steps: list[tuple[int, int, Array]], times: NDArray[np.int64], rotations: Array
+) -> tuple[Array, float, float, float]:
+    """The same with each step's arc laid along the attitude at its middle."""
+    yaw = np.unwrap(np.arctan2(rotations[:, 1, 0], rotations[:, 0, 0]))
+    turn, turned = float(yaw[-1] - yaw[0]), float(np.abs(np.diff(yaw)).sum())
+    if not steps:
+        return np.array([0.0, 0.0, turn]), 0.0, 0.0, turned
+    moves = np.array([m for _, _, m in steps])
+    half = exp(0.5 * log(moves))[:, :3, :3]
+    straight = (np.swapaxes(half, 1, 2) @ moves[:, :3, 3, None])[..., 0]
+    middle = np.array([a + (b - a) // 2 for a, b, _ in steps])
+    k = np.clip(np.searchsorted(times, middle), 1, len(times) - 1)
+    share = np.clip((middle - times[k - 1]) / np.maximum(times[k] - times[k - 1], 1), 0.0, 1.0)
+    between = Rotation.from_matrix(np.swapaxes(rotations[k - 1], 1, 2) @ rotations[k]).as_rotvec() * share[:, None]
+    R = rotations[k - 1] @ Rotation.from_rotvec(between).as_matrix()
+    p = np.sum((R @ straight[..., None])[..., 0], axis=0)
+    c, s = np.cos(yaw[0]), np.sin(yaw[0])
+    return (
+        np.array([c * p[0] + s * p[1], -s * p[0] + c * p[1], turn]), float(p[2]),
+        float(np.linalg.norm(straight, axis=1).sum()), turned,
+    )  # fmt: skip
 
 
 def _upright(up: Array) -> Array:
     """The smallest rotation that takes a direction to the vertical."""
-    from scipy.spatial.transform import Rotation
-
     axis = np.cross(up, [0.0, 0.0, 1.0])
     n = float(np.linalg.norm(axis))
     if n < 1e-6:
-        return np.eye(3)
+        return np.eye(3) if up[2] > 0 else np.diag([1.0, -1.0, -1.0])
     return np.asarray(Rotation.from_rotvec(axis / n * np.arccos(np.clip(up[2], -1, 1))).as_matrix())

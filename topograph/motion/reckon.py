@@ -179,7 +179,7 @@ def _attitude(inertial: Inertial, speed: Array | None, config: MotionConfig) -> 
     first = np.mean(force[: max(5, int(1.0 / max(float(np.median(dt)), 1e-3)))], axis=0)
     roll, pitch = np.arctan2(first[1], first[2]), np.arctan2(-first[0], np.hypot(first[1], first[2]))
     q0 = _quaternion_of(float(roll), float(pitch))
-    q = _filter(q0, rate, force, dt.clip(0, 0.2), config.tilt_time_s, GRAVITY)
+    q = _filter(q0, rate, force, dt.clip(0, 0.2), np.full(len(dt), config.tilt_time_s), GRAVITY)
     return from_quaternion(np.zeros((len(q), 3)), q)[:, :3, :3]
 
 
@@ -206,9 +206,9 @@ def _filter(q0, rate, force, dt, tau, gravity):
             ux, uy, uz = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
             fx, fy, fz = f[0] / size, f[1] / size, f[2] / size
             # A turn by up x force would move the body's measured up onto the predicted one.
-            wx += (fy * uz - fz * uy) / tau
-            wy += (fz * ux - fx * uz) / tau
-            wz += (fx * uy - fy * ux) / tau
+            wx += (fy * uz - fz * uy) / tau[k]
+            wy += (fz * ux - fx * uz) / tau[k]
+            wz += (fx * uy - fy * ux) / tau[k]
         rx, ry, rz = wx * h, wy * h, wz * h
         a = np.sqrt(rx * rx + ry * ry + rz * rz)
         s = np.sin(a / 2) / a if a > 1e-12 else 0.5

@@ -15,7 +15,7 @@ from topograph.bags import Imu, Odometry, Trunks
 from topograph.cli import main
 from topograph.errors import InsufficientDataError
 from topograph.evaluate import Truth, read_tum
-from topograph.geometry import Array, interpolate, to_quaternion
+from topograph.geometry import Array, interpolate
 from topograph.localize import LocalizeConfig, Localizer, ThesisConfig, ThesisMethod
 from topograph.localize.engine import Engine
 from topograph.localize.evidence import describe, weigh

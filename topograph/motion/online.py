@@ -264,7 +264,8 @@ class Reckoner:
         if self._attitude is None and not self._level(ready):
             return np.zeros(0, np.int64), np.zeros((0, 3, 3)), False
         a, R = self._attitude, self.robot_R_imu
-        assert a is not None and R is not None
+        assert a is not None
+        assert R is not None
         ahead = [m for m in self._imu if m[0] > stamp_ns]
         self._imu = ahead
         used = [m for m in ready if m[0] > a.ns]

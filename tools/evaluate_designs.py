@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from topograph.config import Config
-from topograph.evaluate import trunk_metrics
+from topograph.evaluate import Truth, trunk_metrics
 from topograph.evaluate.metrics import match, visible
 from topograph.geometry import interpolate
 from topograph.pipeline import read_run, solve_run, topo_map
@@ -44,12 +44,17 @@ class Result:
     note: str
 
 
-def run(job: tuple[str, int], seconds: float) -> Result:
-    """Simulate, map, compare."""
+def run(job: tuple[str, int], seconds: float, keep: Path | None = None) -> Result:
+    """Simulate, map, compare. Bags in the folder `keep` are taken from there, or left there."""
     design, seed = job
     with tempfile.TemporaryDirectory() as folder:
-        bag = Path(folder) / "run.bag"
-        truth = record(bag, seed, DESIGNS[design], DriveConfig(longest_s=seconds), SensorConfig(sweep_hz=5.0))
+        bag = (keep or Path(folder)) / f"{design}_{seed}.bag"
+        if not bag.exists():
+            whole_bag = bag.with_name("of_" + bag.name)
+            record(whole_bag, seed, DESIGNS[design], DriveConfig(longest_s=seconds), SensorConfig(sweep_hz=5.0))
+            whole_bag.with_suffix(".truth").rename(bag.with_suffix(".truth"))
+            whole_bag.rename(bag)
+        truth = Truth.load(bag.with_suffix(".truth"))
         config = Config()
         read = read_run([bag], config)
         solved = solve_run(read, config)
@@ -94,6 +99,7 @@ def main() -> None:
     a.add_argument("--seeds", type=int, default=5)
     a.add_argument("--first", type=int, default=3001)
     a.add_argument("--seconds", type=float, default=60.0)
+    a.add_argument("--keep", type=Path, help="folder in which the bags stay for another time (about 120 MB each)")
     a.add_argument("-v", "--verbose", action="store_true")
     a = a.parse_args()
     designs = a.designs or list(DESIGNS)
@@ -102,7 +108,7 @@ def main() -> None:
         f"{'design':<10} map P  (worst) R  (worst)  foot mean max  0.8 m  NEES   lean   diameter slope, RMSE   sweeps P, R by 10 m"
     )
     with ProcessPoolExecutor(2) as pool:
-        results = list(pool.map(partial(run, seconds=a.seconds), jobs))
+        results = list(pool.map(partial(run, seconds=a.seconds, keep=a.keep), jobs))
     for n, d in enumerate(designs):
         r = results[n * a.seeds : (n + 1) * a.seeds]
         p, q = [k.right / max(k.found, 1) for k in r], [k.recalled / max(k.shown, 1) for k in r]

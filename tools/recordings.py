@@ -270,10 +270,10 @@ def called_tree(topo: TopoMap, gate: float = 1.0) -> tuple[int, int, list[tuple[
     return len(nodes), len(nodes) - len(wrong), wrong
 
 
-def stem_candidates(name: str, n: int, seed: int) -> tuple[Array, Array]:
-    """Features and classes (0 tree, 2 other, -1 unclear) of candidates in `n` sweeps of a plot, by any sensor in any mounting."""
+def stem_candidates(name: str, n: int, seed: int) -> tuple[Array, Array, Array]:
+    """Features, classes (0 tree, 2 other, -1 unclear) and sweeps of candidates in `n` sweeps of a plot, by any sensor in any mounting."""
     plot, rng = Plot(name), np.random.default_rng([seed, 5])
-    X, y = [], []
+    X, y, sweep = [], [], []
     for k in range(n):
         elevation = [SENSORS["VLP-16"], SENSORS["64 rings"], np.linspace(-16, 15, 32)][rng.choice(3, p=[0.6, 0.2, 0.2])]
         roll, pitch = rng.normal(0, 0.15, 2)
@@ -290,20 +290,21 @@ def stem_candidates(name: str, n: int, seed: int) -> tuple[Array, Array]:
             inside = ((p[:, :2] > plot.low - 0.3) & (p[:, :2] < plot.high + 0.3)).all(axis=1)
             X.append(c.features)
             y.append(np.where(near < 0.12, 0, np.where((near > 0.5) & inside & (unlisted > 1.2), 2, -1)))
-    return np.concatenate(X), np.concatenate(y)
+            sweep.append(np.full(len(p), k))
+    return np.concatenate(X), np.concatenate(y), np.concatenate(sweep)
 
 
 UNLISTED = (1.95, 5.6)
 """A stem with low branches that stands in lpine1's cloud and not in its list, m."""
 
 
-def street_candidates(first: int, last: int, every_ring: int) -> tuple[Array, Array]:
-    """Features and classes of candidates in sweeps of the street, by the hand labels; places drift by up to 0.3 m."""
+def street_candidates(first: int, last: int, every_ring: int) -> tuple[Array, Array, Array]:
+    """Features, classes and sweeps of candidates in sweeps of the street, by the hand labels; places drift by up to 0.3 m."""
     known = labels()
     path = np.loadtxt(DATA / "street_avenue" / "kiss64.tum")
     poses = from_quaternion(path[:, 1:4], path[:, 4:])
     mount = from_xyz_rpy(0, 0, 1.9, 0, 0, 0)
-    X, y = [], []
+    X, y, sweep = [], [], []
     for k, (start, end, xyz, ring, t) in enumerate(module("street_bag").sweeps(first, last, every_ring), first):
         step = log(inverse(poses[max(k - 1, 0)]) @ poses[k]) / ((end - start) * 1e-9) if k else np.zeros(6)
         scan = Scan(end, "lidar", xyz.astype(np.float32), ring.astype(np.int32), (t - (end - start) * 1e-9).astype(np.float32), None)  # fmt: skip
@@ -317,4 +318,5 @@ def street_candidates(first: int, last: int, every_ring: int) -> tuple[Array, Ar
         far = np.hypot(*(p[:, :2] - poses[k, :2, 3]).T)
         X.append(c.features[far < 22.0])
         y.append(label[far < 22.0])
-    return np.concatenate(X), np.concatenate(y)
+        sweep.append(np.full(len(y[-1]), k))
+    return np.concatenate(X), np.concatenate(y), np.concatenate(sweep)

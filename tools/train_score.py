@@ -1,6 +1,7 @@
 """Trains the front end's score on randomised scenes (tools/scenes.py) and calibrates the stated deviations.
 
-    python tools/train_score.py [--scenes 400] [--looks 6]
+    pip install -e '.[train]'
+    python tools/train_score.py [--scenes 900] [--looks 6] --recorded pine_plot lpine1 street
 
 Seeds 0.. train, 100,000.. validate; nothing of them is reported anywhere else. Writes topograph/trunks/score.json.
 """
@@ -12,9 +13,9 @@ import json
 import subprocess
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 
+import network
 import numpy as np
 import recordings
 import scenes
@@ -28,9 +29,8 @@ from topograph.trunks import fit as F
 from topograph.trunks.config import TrunksConfig
 from topograph.trunks.detector import candidates
 from topograph.trunks.features import FEATURES, OVERHEAD
-from topograph.trunks.score import CLIP, ERRORS, forward
+from topograph.trunks.score import ERRORS, Layers, judge, log_softmax, normalised, tree_odds
 
-HIDDEN = (64, 32)
 SHIPPED = Path(__file__).parent.parent / "topograph" / "trunks" / "score.json"
 RECORDED = 0.2
 """Weight of one recording against all scenes."""
@@ -41,8 +41,10 @@ RECORDED_AS = {
 }
 DROPPED = 0.3
 """Share of the training's candidates whose view above trunk height is taken away."""
-PURE, IMPURE = 0.6, 0.15
-"""Shares of a candidate's returns from one thing that make it that thing, or not that thing."""
+PURE, PART, IMPURE = 0.6, 0.3, 0.15
+"""Shares of a candidate's returns from one thing that make it that thing, that thing where it also stands at its place
+(`AT`, m beside the surface), or not that thing."""
+AT = 0.1
 
 
 def labelled(look: scenes.Look, config: TrunksConfig):
@@ -73,8 +75,10 @@ def labelled(look: scenes.Look, config: TrunksConfig):
             continue
         e[k, 7] = np.bincount(m).argmax()
         trunk, post = float(np.mean(m == TRUNK)), float(np.mean(m == POST))
-        near = np.hypot(*(look.feet[:, :2] - c.fits[k, :2]).T) - 0.5 * look.orchard.diameters
-        if trunk >= PURE:
+        rise = (c.fits[k, 2] - look.feet[:, 2]) / look.axes[:, 2]
+        at_axis = look.feet[:, :2] + rise[:, None] * look.axes[:, :2]
+        near = np.hypot(*(at_axis - c.fits[k, :2]).T) - 0.5 * look.orchard.diameters
+        if trunk >= PURE or (trunk >= PART and near.min() < AT):
             y[k] = 0
             j = int(np.bincount(look.swept.tree[i][m == TRUNK]).argmax())
             foot, axis = look.feet[j], look.axes[j]
@@ -88,69 +92,29 @@ def labelled(look: scenes.Look, config: TrunksConfig):
                     c.fits[k, F.TANGENTIAL], c.fits[k, F.WIDE] - look.orchard.diameters[j], look.orchard.stems[j]]  # fmt: skip
         elif post >= PURE:
             y[k] = 1
-        elif max(trunk, post) > IMPURE or near.min() < 0.3:
+        elif max(trunk, post) > IMPURE or near.min() < 2.0 * AT:
             y[k] = -1
     return c.features, y, e
 
 
 def collect_one(seed: int, looks: int):
-    """All candidates of one scene."""
+    """All candidates of one scene, and the sweep of each."""
     config = TrunksConfig()
     try:
         parts = [labelled(k, config) for k in scenes.looks(seed, looks)]
     except ValueError as err:  # a drawn design without room for a tree
         print(f"scene {seed}: {err}")
-        return np.zeros((0, len(FEATURES))), np.zeros(0, int), np.zeros((0, 10))
-    return tuple(np.concatenate(q) for q in zip(*parts, strict=True))
+        return np.zeros((0, len(FEATURES)), np.float32), np.zeros(0, int), np.zeros((0, 10)), np.zeros(0, int)
+    sweep = np.repeat(seed * looks + np.arange(len(parts)), [len(p[1]) for p in parts])
+    X, y, e = (np.concatenate(q) for q in zip(*parts, strict=True))
+    return X.astype(np.float32), y, e, sweep
 
 
 def collect(seeds: range, looks: int):
-    """Features, classes and errors of many scenes, two at a time."""
+    """Features, classes, errors and sweeps of many scenes, two at a time."""
     with ProcessPoolExecutor(2) as pool:
         parts = list(pool.map(partial(collect_one, looks=looks), seeds, chunksize=4))
-    return tuple(np.concatenate([p[k] for p in parts]) for k in range(3))
-
-
-def train(X: Array, y: Array, w: Array, epochs: int = 30, batch: int = 1024, rate: float = 3e-3) -> list[Array]:
-    """Weights and offsets of the layers in turn, by Adam (Kingma & Ba 2015) on the weighted log loss; the rate falls as a
-    cosine. X (N, F) is normalised, y (N,) the class, w (N,) the weight.
-    """
-    rng = np.random.default_rng(0)
-    sizes = [X.shape[1], *HIDDEN, 3]
-    q: list[Array] = []
-    for a, b in pairwise(sizes):
-        q += [rng.normal(0, 1 / np.sqrt(a), (a, b)).astype(np.float32), np.zeros(b, np.float32)]
-    first, second = [np.zeros_like(v) for v in q], [np.zeros_like(v) for v in q]
-    A, target = X.astype(np.float32), np.eye(3, dtype=np.float32)[y]
-    weight = (w / w.mean()).astype(np.float32)[:, None]
-    steps, k = epochs * (len(A) // batch), 0
-    for epoch in range(epochs):
-        order, loss = rng.permutation(len(A)), 0.0
-        for i in range(0, len(A) - batch + 1, batch):
-            rows = order[i : i + batch]
-            h = [A[rows]]
-            for j in range(0, len(q) - 2, 2):
-                h.append(np.tanh(h[-1] @ q[j] + q[j + 1]))
-            z = h[-1] @ q[-2] + q[-1]
-            z = z - z.max(1, keepdims=True)
-            log_p = z - np.log(np.exp(z).sum(1, keepdims=True))
-            loss -= float(np.mean(weight[rows] * np.sum(target[rows] * log_p, 1, keepdims=True))) / (len(A) // batch)
-            g = weight[rows] * (np.exp(log_p) - target[rows]) / batch
-            gradient = [np.zeros(0)] * len(q)
-            for j in range(len(q) - 2, -1, -2):
-                gradient[j], gradient[j + 1] = h[j // 2].T @ g, g.sum(0)
-                if j:
-                    g = (g @ q[j].T) * (1 - h[j // 2] ** 2)
-            k += 1
-            now = 0.5 * rate * (1 + np.cos(np.pi * k / steps))
-            for j in range(len(q)):
-                first[j] = 0.9 * first[j] + 0.1 * gradient[j]
-                second[j] = 0.999 * second[j] + 0.001 * gradient[j] ** 2
-                step = (first[j] / (1 - 0.9**k)) / (np.sqrt(second[j] / (1 - 0.999**k)) + 1e-8)
-                q[j] = q[j] - np.float32(now) * (step + 1e-4 * q[j]).astype(np.float32)
-        if epoch % 10 == 9:
-            print(f"epoch {epoch + 1}: loss {loss:.4f}", flush=True)
-    return q
+    return tuple(np.concatenate([p[k] for p in parts]) for k in range(4))
 
 
 def error_model(X: Array, e: Array, which: int) -> Array:
@@ -171,31 +135,38 @@ def error_model(X: Array, e: Array, which: int) -> Array:
     return np.asarray(minimize(cost, np.r_[0.3, np.zeros(len(columns))], jac=True, method="L-BFGS-B").x)
 
 
-def recorded(names: list[str], share: Array) -> tuple[Array, Array, Array]:
-    """Features, classes and weights of candidates of recordings: each of them weighs a share of all that was simulated."""
-    X, y, w = [np.zeros((0, len(FEATURES)))], [np.zeros(0, int)], [np.zeros(0)]
+def recorded(names: list[str], share: Array) -> tuple[Array, Array, Array, Array]:
+    """Features, classes, weights and sweeps of candidates of recordings: each of them weighs a share of all that was simulated."""
+    X, y, w, sweep = [np.zeros((0, len(FEATURES)))], [np.zeros(0, int)], [np.zeros(0)], [np.zeros(0, int)]
     for name in names:
         kept = Path("/tmp") / f"topograph_{name}.npz"
         if not kept.exists():
             if name == "street":
                 parts = [recordings.street_candidates(0, 150, every) for every in (1, 2, 4)]
-                found = tuple(np.concatenate([p[k] for p in parts]) for k in range(2))
+                found = tuple(
+                    np.concatenate([p[k] + (k == 2) * 1000 * n for n, p in enumerate(parts)]) for k in range(3)
+                )
             else:
                 found = recordings.stem_candidates(name, 200, 7000)
-            np.savez_compressed(kept, X=found[0], y=found[1])
+            np.savez_compressed(kept, X=found[0], y=found[1], sweep=found[2])
         with np.load(kept) as f:
-            sure = f["y"] >= 0
-            X.append(f["X"][sure])
-            y.append(f["y"][sure])
-        w.append((RECORDED * share / np.maximum(np.bincount(y[-1], minlength=3), 1))[y[-1]])
-        print(name, "candidates: tree, post, other:", np.bincount(y[-1], minlength=3))
-    return np.concatenate(X), np.concatenate(y), np.concatenate(w)
+            X.append(f["X"])
+            y.append(f["y"])
+            sweep.append(f["sweep"] + RECORDED_FROM * (1 + len(sweep)))
+        count = np.bincount(y[-1][y[-1] >= 0], minlength=3)
+        w.append((RECORDED * share / np.maximum(count, 1))[y[-1]])
+        print(name, "candidates: tree, post, other:", count)
+    return np.concatenate(X), np.concatenate(y), np.concatenate(w), np.concatenate(sweep)
+
+
+RECORDED_FROM = 10_000_000
+"""Sweeps of recordings are numbered from here on, those of simulated scenes below."""
 
 
 def main() -> None:
     """Collect, train, calibrate, validate, write."""
     a = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    a.add_argument("--scenes", type=int, default=400)
+    a.add_argument("--scenes", type=int, default=900)
     a.add_argument("--looks", type=int, default=6)
     a.add_argument("--cache", type=Path, help="keep what was collected here")
     a.add_argument(
@@ -205,28 +176,27 @@ def main() -> None:
     a = a.parse_args()
     if a.cache and a.cache.exists():
         with np.load(a.cache) as f:
-            X, y, e, Xv, yv, ev = (f[k] for k in ("X", "y", "e", "Xv", "yv", "ev"))
+            X, y, e, sweep, Xv, yv, ev, sweep_v = (f[k] for k in ("X", "y", "e", "sweep", "Xv", "yv", "ev", "sweep_v"))
     else:
-        X, y, e = collect(range(a.scenes), a.looks)
-        Xv, yv, ev = collect(range(100_000, 100_000 + max(a.scenes // 5, 1)), a.looks)
+        X, y, e, sweep = collect(range(a.scenes), a.looks)
+        Xv, yv, ev, sweep_v = collect(range(100_000, 100_000 + max(a.scenes // 5, 1)), a.looks)
         if a.cache:
-            np.savez_compressed(a.cache, X=X, y=y, e=e, Xv=Xv, yv=yv, ev=ev)
+            np.savez(a.cache, X=X, y=y, e=e, sweep=sweep, Xv=Xv, yv=yv, ev=ev, sweep_v=sweep_v)
     print("candidates: tree, post, other, unclear:", [(y == k).sum() for k in (0, 1, 2, -1)])
-    X, y, e = X[y >= 0], y[y >= 0], e[y >= 0]
     rng = np.random.default_rng(1)
     overhead = [FEATURES.index(k) for k in OVERHEAD]
-    Z = X.copy()
-    blind = rng.random(len(Z)) < DROPPED
-    Z[np.ix_(blind, overhead)] = 0.0
-    mean, deviation = Z.mean(0), Z.std(0) + 1e-6
     # What stands in a scene differs more between scenes than a prior could know; posts are fewer than trees.
     share = np.exp(KIND_PRIOR)
-    weight = (share / np.bincount(y, minlength=3))[y]
-    Zr, yr, wr = recorded(a.recorded, share)
-    Zr[np.ix_(rng.random(len(Zr)) < DROPPED, overhead)] = 0.0
-    every = np.clip((np.concatenate([Z, Zr]) - mean) / deviation, -CLIP, CLIP)
-    layers = train(every, np.concatenate([y, yr]), np.concatenate([weight, wr]))
-    N = np.clip((X - mean) / deviation, -CLIP, CLIP)
+    weight = (share / np.bincount(y[y >= 0], minlength=3))[y]
+    Zr, yr, wr, sweep_r = recorded(a.recorded, share)
+    Z, every = np.concatenate([X, Zr]), np.concatenate([sweep, sweep_r])
+    names, rows = np.unique(every, return_inverse=True)
+    Z[np.ix_((rng.random(len(names)) < DROPPED)[rows], overhead)] = 0.0
+    mean, deviation = Z[: len(X)].mean(0, dtype=float), Z[: len(X)].std(0, dtype=float) + 1e-6
+    layers = network.train(normalised(Z, mean, deviation), np.r_[y, yr], np.r_[weight, wr], every)
+    Xs, y_all = X, y
+    X, y, e = X[y >= 0], y[y >= 0], e[y >= 0]
+    N = normalised(X, mean, deviation)
     one = (y == 0) & (e[:, 6] == 1) & (np.hypot(e[:, 1], e[:, 2]) < 0.25)  # stems of one tree have axes of their own
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
@@ -236,12 +206,12 @@ def main() -> None:
         "training_seeds": [0, a.scenes - 1],
         "recordings": [RECORDED_AS[k] for k in a.recorded],
         "features": list(FEATURES),
-        "mean": mean, "deviation": deviation, "low": np.minimum(Z.min(0), Zr.min(0, initial=1e9)), "high": np.maximum(Z.max(0), Zr.max(0, initial=-1e9)),
+        "mean": mean, "deviation": deviation, "low": np.minimum(Z.min(0), Xs.min(0)), "high": np.maximum(Z.max(0), Xs.max(0)),
         "error_scale": np.stack([error_model(N[one], e[one], k) for k in (0, 1)]),
-        "layers": layers,
+        **layers._asdict(),
     }  # fmt: skip
     text = {
-        k: [np.round(q.astype(float), 4).tolist() for q in v] if k == "layers"
+        k: [np.round(q.astype(float), 4).tolist() for q in v] if k in Layers._fields
         else np.round(v, 5).tolist() if isinstance(v, np.ndarray) else v
         for k, v in data.items()
     }  # fmt: skip
@@ -263,11 +233,13 @@ def main() -> None:
     one &= X[:, 2] > np.log(6)
     A = np.stack([X[one, 3], X[one, 3] * 0 + 1, e[one, 0]], 1)
     print("width less diameter = a width + b + c range:", np.linalg.lstsq(A, e[one, 5], rcond=None)[0].round(4))
-    Xv, yv = Xv[yv >= 0], yv[yv >= 0]
-    for name, X_, y_ in (("train", X, y), ("validation", Xv, yv)):
-        z = forward(np.clip((X_ - mean) / deviation, -CLIP, CLIP).astype(np.float32), layers)
-        odds = z[:, 0] - np.logaddexp(z[:, 1], z[:, 2])
-        p = odds > 0
+    for name, X_, y_, sweep_ in (("train", Xs, y_all, sweep), ("validation", Xv, yv, sweep_v)):
+        order = np.argsort(sweep_, kind="stable")
+        X_, y_ = X_[order], y_[order]
+        parts = np.split(normalised(X_, mean, deviation), np.flatnonzero(np.diff(sweep_[order])) + 1)
+        z = np.concatenate([judge(x, layers) for x in parts])[y_ >= 0]
+        X_, y_ = X_[y_ >= 0], y_[y_ >= 0]
+        p = tree_odds(log_softmax(z)) > 0
         cells = []
         for lo, hi in ((0, 10), (10, 20), (20, 30)):
             here = (np.exp(X_[:, 0]) >= lo) & (np.exp(X_[:, 0]) < hi)

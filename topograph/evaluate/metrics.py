@@ -28,11 +28,17 @@ class Metric:
 
 
 def match(found: Array, true: Array, gate: float = MATCH_GATE) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices (M,), (M,) of found (N, 2) and true (K, 2) positions that are one, nearest together in sum, within `gate`."""
+    """Indices (M,), (M,) of found (N, 2) and true (K, 2) positions that are one: nearest together in sum, where a pair further
+    apart than `gate` costs no more than the gate (the assignment of GOSPA, Rahmathullah et al. 2017). If it cost more, a false
+    node at one end of a dense row would push all others onto their neighbours.
+    """
     if len(found) == 0 or len(true) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    d = np.linalg.norm(found[:, None] - true[None], axis=2)
-    i, j = linear_sum_assignment(np.minimum(d, 10 * gate))
+    return _assign(np.linalg.norm(found[:, None] - true[None], axis=2), gate)
+
+
+def _assign(d: Array, gate: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    i, j = linear_sum_assignment(np.minimum(d, gate))
     ok = d[i, j] < gate
     return i[ok].astype(np.int64), j[ok].astype(np.int64)
 
@@ -186,9 +192,7 @@ def trunk_metrics(
         seen = truth.returns[index[s]] >= 5
         at = foot[None, :, :2] + ((q[:, None, 2] - foot[None, :, 2]) / axis[None, :, 2])[..., None] * axis[None, :, :2]
         d = np.linalg.norm(q[:, None, :2] - at, axis=2) if len(q) else np.zeros((0, len(foot)))
-        i, j = linear_sum_assignment(np.minimum(d, 5.0)) if len(q) else (np.zeros(0, int), np.zeros(0, int))
-        ok = d[i, j] < gate if len(q) else np.zeros(0, bool)
-        i, j = i[ok], j[ok]
+        i, j = _assign(d, gate)
         matched = np.zeros(len(foot), bool)
         matched[j] = True
         own = np.zeros(len(q), bool)

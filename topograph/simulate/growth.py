@@ -228,9 +228,14 @@ class Build:
     def _yard(self, config: OrchardConfig, places: Array) -> None:
         rng = self.rng
         for _ in range(config.walls):
-            c = self.foot(self._outside(places, 3.0, 12.0)) + [0, 0, 1.5]
-            half = [rng.uniform(0.4, 6.0), rng.uniform(0.2, 4.0), rng.uniform(1.2, 3.5)]
-            self.boxes.append([*c, *half, rng.uniform(0, np.pi), 1e3, WALL])
+            for _ in range(20):  # no tree grows through a wall
+                c = self.foot(self._outside(places, 3.0, 12.0)) + [0, 0, 1.5]
+                half = [rng.uniform(0.4, 6.0), rng.uniform(0.2, 4.0), rng.uniform(1.2, 3.5)]
+                yaw = rng.uniform(0, np.pi)
+                d = (places - c[:2]) @ np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+                if (np.abs(d) > np.array(half[:2]) + 1.0).any(axis=1).all():
+                    self.boxes.append([*c, *half, yaw, 1e3, WALL])
+                    break
         for _ in range(config.cars):
             xy, yaw = self._outside(places, 1.5, 9.0), rng.uniform(0, np.pi)
             foot = self.foot(xy)

@@ -14,7 +14,7 @@ from topograph.trees.screen import parts_apart
 from topograph.trees.tracks import TreesConfig
 from topograph.trunks.score import OTHER, TREE
 
-KIND_PRIOR = np.log(np.array([0.45, 0.1, 0.45]))
+KIND_PRIOR = np.log(np.array([0.2, 0.06, 0.74]))
 """Shares of the kinds that the score was trained with."""
 FRESH = 0.25
 """Share of what a further sighting of the same tree says that the ones before have not said."""
@@ -24,8 +24,10 @@ SLIPS = 2.0
 """Scans that may have seen through a tree by mistake: a mixed pixel, a pose that is off for a moment."""
 STILL = 0.6
 """Parts of a landmark's sightings lie no further apart in the solved map, m: half of a thick trunk."""
-UNUSUAL = 1.0
-"""Log-odds below the run's median that a tree may always score."""
+NEAR = 5.0
+"""Range at which a sighting tells half as much of what a thing is as one at arm's length, m."""
+DOUBTFUL = 0.25
+"""Log-odds below which nothing is a tree, where the run's trees are hardly told from the rest: see `TreesConfig.usual_score`."""
 BLOCK = 100_000
 """Pairs of scans and trees that are looked at together."""
 REACH = 31.0
@@ -38,7 +40,7 @@ class Existence:
 
     Attributes:
         ok: (T,) it exists as a landmark; `kind` (T,) TREE, POST or OTHER; `probability` (T,) of that kind, NaN unknown.
-        score: (T,) mean log-odds of tree; `hits` (T,) sightings; `passed` (T,) scans that saw through its place.
+        score: (T,) mean log-odds of tree, of near sightings above all; `hits` (T,) sightings; `passed` (T,) scans that saw through its place.
     """
 
     ok: NDArray[np.bool_]
@@ -67,7 +69,8 @@ def exists(
     d, n = detections, len(places)
     used = tree >= 0
     hits = np.bincount(tree[used], minlength=n)
-    score = np.bincount(tree[used], d.score[used], minlength=n) / np.maximum(hits, 1)
+    weight = _weight(d, used)
+    score = np.bincount(tree[used], weight * d.score[used], n) / np.maximum(np.bincount(tree[used], weight, n), 1e-9)
     scan, which = _pairs(d, map_T_scan, places)
     seen = np.isin(scan * n + which, d.scan[used] * n + tree[used])
     p = _seen_from(map_T_scan, scan, places, which)
@@ -87,9 +90,13 @@ def exists(
     if (d.score[used] != 0.0).any():  # recorded detections may come without
         # Scores differ between sensors and orchards: what counts is also how this run's own trees score.
         surely = ok & (kind == TREE)
-        usual = _usual(score[surely], hits[surely])
-        ok &= (kind != TREE) | (score >= min(config.usual_score * usual, usual - UNUSUAL))
+        ok &= (kind != TREE) | (score >= config.usual_score * _usual(score[surely], hits[surely]) - DOUBTFUL)
     return Existence(ok=ok & (kind != OTHER), kind=kind, probability=probability, score=score, hits=hits, passed=passed)
+
+
+def _weight(d: Detections, rows: NDArray[np.bool_]) -> Array:
+    """How much of what a thing is each sighting tells, at `rows` (N,)."""
+    return np.asarray(1.0 / (1.0 + np.sum(d.p[rows, :2] ** 2, axis=1) / NEAR**2))
 
 
 def _usual(score: Array, hits: NDArray[np.int64]) -> float:
@@ -143,7 +150,7 @@ def _kinds(d: Detections, tree: NDArray[np.int64], n: int) -> tuple[NDArray[np.i
     if not told.any():
         return np.full(n, TREE), np.full(n, np.nan)
     t = tree[told]
-    weight = 1.0 / (1.0 + (np.linalg.norm(d.p[told, :2], axis=1) / 12.0) ** 2)
+    weight = _weight(d, told)
     total = np.bincount(t, weight, n)
     ratio = d.kinds[told] - KIND_PRIOR
     mean = (

@@ -29,7 +29,7 @@ class TreesConfig:
         merge: two trees nearer than this are one (stems of one tree), m.
         min_sightings, min_ratio: of a tree that exists; ratio of sightings to scans that should show it (recorded detections);
         passed: scans that saw through its place, for each that saw it, that a tree survives;
-        usual_score: share of the run's median score of trees that is enough;
+        usual_score: share of the run's median score of trees that is enough (less existence.DOUBTFUL);
         min_share: of the sightings that trees of the same run have at the median.
     """
 
@@ -45,7 +45,7 @@ class TreesConfig:
     min_sightings: int = 6
     min_ratio: float = 0.15
     passed: float = 0.1
-    usual_score: float = 0.25
+    usual_score: float = 0.18
     min_share: float = 0.03
 
 

@@ -35,7 +35,7 @@ class TrunksConfig:
     widest: float = 1.3
     prior_diameter: float = 0.25
     prior_sigma: float = 0.09
-    min_score: float = -2.0
+    min_score: float = -3.0
     score: str = ""
     recorded_sigma: float = 0.05
     recorded_growth: float = 0.01

@@ -126,7 +126,7 @@ class Detector:
         keep = odds > self.config.min_score
         fits, kinds, odds, name = c.fits[keep], kinds[keep], odds[keep], c.name[keep]
         group = suppress(fits, odds, STEM_DISTANCE)
-        best, merged = merge_stems(fits, odds, group)
+        best, merged = merge_stems(fits, scoring.tree_odds(kinds), group)
         wanted = np.full(len(c.runs), -1, np.int64)
         wanted[name] = np.searchsorted(best, group)
         rows, ends = gather(wanted, len(best), c.chain, c.runs, c.label, FIRST, LAST)

@@ -34,16 +34,20 @@ from topograph.trunks.passage import (
     TRUNK_RINGS,
     look_at,
 )
+from topograph.trunks.patch import HIGH_NAMES, PATCH_NAMES, PATCH_SIZE, look_at_patch
 from topograph.trunks.runs import FIRST, FREE, LAST, RANGE, RING, WIDTH, look_around
 
 FEATURES = (
     "range", "rings", "points", "width", "width_spread", "rough", "line_rms", "lean", "free", "lowest", "highest",
     "taper", "depth_slope", "fill", "ring_gap", "undergrowth", "close_by", "beside", "slant", "bow", "holes",
     "trunk_passed", "trunk_met", "axis_met", "axis_seen", "crown", "crown_seen", "top",
-    "canopy", "overhead", "covered_near", "covered",
+    "canopy", "overhead", "covered_near", "covered", *PATCH_NAMES,
 )  # fmt: skip
-"""Lengths in m; counts as logarithms. From `axis_met` on: what is above trunk height, 0 where nothing looked there."""
-OVERHEAD = ("axis_met", "axis_seen", "crown", "crown_seen", "top", "canopy", "overhead", "covered_near", "covered")
+"""Lengths in m; counts as logarithms. From `axis_met` to `covered`: what is above trunk height, 0 where nothing looked
+there. Then the patch: what the beams met around it, see patch.py."""
+OVERHEAD = (
+    "axis_met", "axis_seen", "crown", "crown_seen", "top", "canopy", "overhead", "covered_near", "covered", *HIGH_NAMES,
+)  # fmt: skip
 """Features that need beams above the trunk: left out at random in training, so that no tree needs a crown."""
 
 # Columns of FEATURES.
@@ -53,6 +57,7 @@ OVERHEAD = ("axis_met", "axis_seen", "crown", "crown_seen", "top", "canopy", "ov
     _TRUNK_PASSED, _TRUNK_MET, _AXIS_MET, _AXIS_SEEN, _CROWN, _CROWN_SEEN, _TOP,
     _CANOPY, _OVERHEAD, _COVERED_NEAR, _COVERED,
 ) = range(32)  # fmt: skip
+_PATCH = len(FEATURES) - PATCH_SIZE
 BEHIND = 0.25
 """A return so far behind a run, between its ends, went through it, m."""
 
@@ -75,6 +80,7 @@ def describe(p, r, runs, label, order, ends, fits, name, near, tangent, R, eye, 
         _surface(p, r, runs, label, mine, a, lx, ly, radius, f)
         _around(above, beside, a, lx, ly, radius, f)
         _beams(near, tangent, R, eye, a, lx, ly, radius, highest, f)
+        look_at_patch(near, tangent, R, eye, a[X], a[Y], a[Z], lx, ly, a[Z] - a[ABOVE], radius, f[_PATCH:])
     return out
 
 

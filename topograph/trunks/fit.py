@@ -247,7 +247,8 @@ def suppress(out, score, distance):
 @njit(cache=True)
 def merge_stems(fits, odds, group):
     """Rows (B,) of the best of each group, and their fits (B, OUT_SIZE): stems of one tree meet at its foot, and their
-    mean, by points, stands for the tree. A stem is as thick as a third of the best and stands beside it.
+    mean, by points, stands for the tree. A stem is as thick as a third of the best, stands beside it, and its log-odds of
+    being a tree, `odds` (C,), are positive and half of the best's.
     """
     n = len(group)
     best = np.empty(n, np.int64)
@@ -261,7 +262,9 @@ def merge_stems(fits, odds, group):
         total, stems = 0.0, 0
         mean, lever, above = np.zeros(6), 0.0, 0.0
         for j in range(n):
-            if group[j] != i or odds[j] <= min(0.5 * odds[i], odds[i] - 1.0) or fits[j, WIDE] < 0.33 * fits[i, WIDE]:
+            if group[j] != i or fits[j, WIDE] < 0.33 * fits[i, WIDE]:
+                continue
+            if j != i and odds[j] <= max(0.5 * odds[i], 0.0):
                 continue
             total += fits[j, POINTS]
             stems += 1

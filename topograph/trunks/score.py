@@ -7,6 +7,7 @@ import json
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,26 @@ KINDS = ("tree", "post", "other")
 TREE, POST, OTHER = range(3)
 CLIP = 4.0
 """Features further than this from the training's mean, in its deviations, tell no more than that they are far."""
+ALONE = 1.0
+"""Trees' worth of the training's mean that is mixed to the mean of a sweep's trees: few trees tell little."""
+LEAST = 8.0
+"""Log-probabilities below minus this are all the same."""
 TEMPER = 0.5
 """Share of the log-odds that is left to a candidate outside of what was trained on."""
+
+
+class Layers(NamedTuple):
+    """Weights and offsets in turn.
+
+    Attributes:
+        describe: of the layers that describe a candidate by itself.
+        alone: of the one that judges it by that.
+        beside: of those that judge it beside the trees of its sweep.
+    """
+
+    describe: list[NDArray[np.float32]]
+    alone: list[NDArray[np.float32]]
+    beside: list[NDArray[np.float32]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +50,7 @@ class Network:
     Attributes:
         mean, deviation: (F,) of the features in training; `low`, `high` (F,) their range there.
         error_scale: (2, 1 + len(ERRORS)) weights of the model of radial and tangential deviations.
-        layers: weights and offsets of each layer in turn.
+        layers: see `judge`.
     """
 
     mean: Array
@@ -39,7 +58,7 @@ class Network:
     low: Array
     high: Array
     error_scale: Array
-    layers: list[NDArray[np.float32]]
+    layers: Layers
 
 
 @functools.lru_cache(maxsize=4)
@@ -55,27 +74,54 @@ def network(file: str = "") -> Network:
         if tuple(data["features"]) != FEATURES:
             raise InputError(f"{file or 'trunks/score.json'} was trained for other features: run tools/train_score.py")
         row = {k: np.array(data[k], float) for k in ("mean", "deviation", "low", "high", "error_scale")}
-        return Network(layers=[np.array(v, np.float32) for v in data["layers"]], **row)
+        layers = Layers(**{k: [np.array(v, np.float32) for v in data[k]] for k in Layers._fields})
+        return Network(layers=layers, **row)
     except (OSError, ValueError, KeyError, TypeError) as err:
         raise InputError(f"{file}: not a score file ({err}); tools/train_score.py writes them") from err
 
 
 def kinds(features: Array, n: Network) -> Array:
-    """Log-probabilities (C, 3) of KINDS of candidates with `features` (C, len(FEATURES))."""
-    x = np.clip((features - n.mean) / n.deviation, -CLIP, CLIP).astype(np.float32)
-    z = forward(x, n.layers)
+    """Log-probabilities (C, 3) of KINDS of candidates of one sweep with `features` (C, len(FEATURES))."""
+    z = judge(normalised(features, n.mean, n.deviation), n.layers)
     # Outside of what was trained on nobody knows: the answer is drawn towards "undecided", and many sightings decide.
     far = ((features < n.low) | (features > n.high)).any(axis=1)
     z[far] *= TEMPER
+    return log_softmax(z)
+
+
+def normalised(features: Array, mean: Array, deviation: Array) -> NDArray[np.float32]:
+    """Features (C, F) in deviations from the training's mean, clipped."""
+    return np.asarray(np.clip((features - mean) / deviation, -CLIP, CLIP).astype(np.float32))
+
+
+def judge(x: NDArray[np.float32], layers: Layers) -> Array:
+    """Scores (C, 3) of KINDS of the candidates of one sweep with normalised features `x` (C, F).
+
+    Each is judged alone first, then beside the mean of what was taken for the sweep's other trees, how many they are, and
+    how many posts: where trees have crowns, a thin thing without one is a post (a network on sets, Zaheer et al. 2017).
+    """
+    h = np.maximum(_forward(x, layers.describe), 0.0)
+    z = _forward(h, layers.alone)
+    log_p = log_softmax(z)
+    p = np.exp(log_p)
+    others = np.maximum(p[:, :2].sum(axis=0) - p[:, :2], 0.0)
+    weighted = p[:, TREE, None] * h
+    mean = (weighted.sum(axis=0) - weighted) / (others[:, TREE, None] + ALONE)
+    seen = np.concatenate([h, np.maximum(log_p, -LEAST), np.log1p(others), mean], axis=1)
+    return np.asarray(z + _forward(seen, layers.beside), float)
+
+
+def _forward(x: NDArray[np.float32], layers: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Linear layers with rectifiers between them."""
+    for k in range(0, len(layers) - 2, 2):
+        x = np.maximum(x @ layers[k] + layers[k + 1], 0.0)
+    return np.asarray(x @ layers[-2] + layers[-1])
+
+
+def log_softmax(z: NDArray[Any]) -> NDArray[Any]:
+    """Logarithms (C, 3) of probabilities from scores (C, 3)."""
     top = z.max(axis=1, keepdims=True)
     return np.asarray(z - top - np.log(np.exp(z - top).sum(axis=1, keepdims=True)))
-
-
-def forward(x: NDArray[np.float32], layers: list[NDArray[np.float32]]) -> Array:
-    """The network: layers of tanh, the last one linear."""
-    for k in range(0, len(layers) - 2, 2):
-        x = np.tanh(x @ layers[k] + layers[k + 1])
-    return np.asarray(x @ layers[-2] + layers[-1], float)
 
 
 def tree_odds(log_p: Array) -> Array:

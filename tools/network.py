@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from topograph.geometry import Array
 from topograph.trunks.score import ALONE, LEAST, Layers
 
-WIDTHS = (192, 96, 96)
+WIDTHS = (128, 64, 64)
 """Of the layers: two that describe a candidate, one that judges it beside the trees of its sweep."""
 DROPOUT = 0.1
 SWEEPS = 24

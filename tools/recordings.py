@@ -23,7 +23,7 @@ from topograph.geometry import Array, align_se3, from_quaternion, from_xyz_rpy, 
 from topograph.motion import Motion
 from topograph.pipeline import read_run, solve_run, topo_map
 from topograph.topomap import TopoMap
-from topograph.trees import Detections, exists, follow, refine, screen, shapes, tabulate
+from topograph.trees import Detections, exists, follow, refine, relevelled, screen, shapes, tabulate
 from topograph.trunks import TrunksConfig, fit
 from topograph.trunks.detector import candidates
 
@@ -221,9 +221,10 @@ def map_at(poses: Array, trunks: list[Trunks], config: Config) -> Mapped:
     tree = refine(t, np.arange(len(t.hits)), config.trees)[track]
     n = int(tree.max(initial=-1)) + 1
     total = np.bincount(tree, 1.0 / variance, n)
+    s = shapes(d, tree, poses, n)
+    seen = transform(poses[d.scan], relevelled(d, tree, poses, s).p)
     place = np.stack([np.bincount(tree, seen[:, k] / variance, n) / total for k in range(3)], axis=1)
     e = exists(d, tree, poses, place, config.trees)
-    s = shapes(d, tree, poses, n)
     foot = place - s.axis * (s.height / s.axis[:, 2])[:, None]
     ok = np.flatnonzero(e.ok)
     return Mapped(place[ok], s.height[ok], foot[ok], e.kind[ok], s.diameter[ok], 1.0 / np.sqrt(total[ok]))

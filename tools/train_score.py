@@ -1,7 +1,7 @@
 """Trains the front end's score on randomised scenes (tools/scenes.py) and calibrates the stated deviations.
 
     pip install -e '.[train]'
-    python tools/train_score.py [--scenes 900] [--looks 6] --recorded pine_plot lpine1 street
+    python tools/train_score.py [--scenes 1200] [--looks 6] --recorded pine_plot lpine1 street
 
 Seeds 0.. train, 100,000.. validate; nothing of them is reported anywhere else. Writes topograph/trunks/score.json.
 """
@@ -92,7 +92,7 @@ def labelled(look: scenes.Look, config: TrunksConfig):
                     c.fits[k, F.TANGENTIAL], c.fits[k, F.WIDE] - look.orchard.diameters[j], look.orchard.stems[j]]  # fmt: skip
         elif post >= PURE:
             y[k] = 1
-        elif max(trunk, post) > IMPURE or near.min() < 2.0 * AT:
+        elif max(trunk, post) > IMPURE or (trunk > 0.0 and near.min() < 2.0 * AT):
             y[k] = -1
     return c.features, y, e
 
@@ -166,7 +166,7 @@ RECORDED_FROM = 10_000_000
 def main() -> None:
     """Collect, train, calibrate, validate, write."""
     a = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    a.add_argument("--scenes", type=int, default=900)
+    a.add_argument("--scenes", type=int, default=1200)
     a.add_argument("--looks", type=int, default=6)
     a.add_argument("--cache", type=Path, help="keep what was collected here")
     a.add_argument(

@@ -21,6 +21,7 @@ from topograph.trees import (
     Detections,
     Existence,
     LoopCloser,
+    Shapes,
     TrackTable,
     choose_keyframes,
     exists,
@@ -42,7 +43,7 @@ class Solved:
 
     Attributes:
         tree: (N,) tree of each detection (-1: none), numbered as in the estimate.
-        existence: of the trees, (T,) rows.
+        existence, shapes: of the trees, (T,) rows.
         problem, estimate, motion, detections, run: the products on the way.
         held_out: (H,) indices of the fixes withheld from the estimator.
         rejected: trees that did not exist.
@@ -56,6 +57,7 @@ class Solved:
     estimate: Estimate
     tree: NDArray[np.int64]
     existence: Existence
+    shapes: Shapes
     held_out: NDArray[np.int64]
     rejected: int
     loops: int
@@ -115,7 +117,8 @@ def solve_run(
     if known is not None:
         problem = replace(problem, known=_known_trees(known, detections))
     seconds = {"read": run.seconds}
-    tree, problem, estimate, existence, rejected, loops = _associate_and_solve(problem, track, config, progress)
+    decided, estimate, loops = _associate_and_solve(problem, track, config, progress)
+    problem = decided.problem
     seconds["associate and solve"] = time.perf_counter() - began
     return Solved(
         run,
@@ -123,10 +126,11 @@ def solve_run(
         problem.detections,
         problem,
         estimate,
-        tree,
-        existence,
+        decided.tree,
+        decided.existence,
+        decided.shapes,
         np.flatnonzero(~used),
-        rejected,
+        decided.rejected,
         loops,
         seconds,
     )
@@ -167,6 +171,19 @@ def _keyframes(detections: Detections, motion: Motion, config: Config) -> NDArra
     else:
         stamps = np.unique(np.concatenate([stamps[inside], motion.stamps_ns[[0, -1]]]))
     return stamps[choose_keyframes(motion, stamps, c.keyframe_distance, c.keyframe_turn, c.keyframe_seconds)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Decided:
+    """Tree (N,) of each detection, the problem of the trees that exist with their own axes, what was decided of them, their
+    shapes, and how many do not exist.
+    """
+
+    tree: NDArray[np.int64]
+    problem: Problem
+    existence: Existence
+    shapes: Shapes
+    rejected: int
 
 
 class _Association:
@@ -215,10 +232,8 @@ class _Association:
         self.problem = replace(self.problem, start=e.map_T_robot)
         return graph.solve(self.problem, self.config.estimate, quick=True, patient=patient)
 
-    def decide(self, e: Estimate) -> tuple[NDArray[np.int64], Problem, Existence, int]:
-        """Tree (N,) of each detection, the problem of the trees that exist with their own axes, what was decided of them,
-        and how many do not exist, given an estimate.
-        """
+    def decide(self, e: Estimate) -> _Decided:
+        """What there is, given an estimate."""
         c, d = self.config.trees, self.problem.detections
         t = self.table(e)
         self.tree_of_track = refine(t, self.tree_of_track, c)
@@ -233,13 +248,13 @@ class _Association:
         if self.problem.known is not None:  # what the map knows exists, however rarely this run saw it
             keep[self.tree_of_track[self.tracks :]] = True
         problem, tree, final = self.with_trees(self.tree_of_track, 1, keep)
-        shape = shapes(d, tree, map_T_scan, len(final))
-        if problem.known is not None:  # the map states its trees at one height, whatever their stems
-            shape.stems[problem.known.tree[problem.known.tree >= 0]] = 1
+        # A known map states its trees at one height, whatever their stems.
+        whole = None if problem.known is None else problem.known.tree[problem.known.tree >= 0]
+        shape = shapes(d, tree, map_T_scan, len(final), whole)
         own = relevelled(d, tree, map_T_scan, shape)
         sightings = gather(own, tree, problem.stamps_ns, problem.motion)
         problem = replace(problem, start=e.map_T_robot, detections=own, sightings=sightings)
-        return tree, problem, found.select(np.searchsorted(ids, final)), int((~found.ok).sum())
+        return _Decided(tree, problem, found.select(np.searchsorted(ids, final)), shape, int((~found.ok).sum()))
 
     def with_trees(
         self, tree_of_track: NDArray[np.int64], least: int, keep: NDArray[np.bool_] | None = None
@@ -263,14 +278,15 @@ class _Association:
 
 def _associate_and_solve(
     problem: Problem, track: NDArray[np.int64], config: Config, progress: Progress
-) -> tuple[NDArray[np.int64], Problem, Estimate, Existence, int, int]:
+) -> tuple[_Decided, Estimate, int]:
     d = problem.detections
     estimate = graph.solve(problem, config.estimate, quick=True)
     if not len(d):
         problem = replace(problem, start=estimate.map_T_robot)
         none = np.zeros(0, np.int64)
         nothing = exists(d, none, np.zeros((0, 4, 4)), np.zeros((0, 3)), config.trees)
-        return none, problem, replace(graph.solve(problem, config.estimate), tree=none), nothing, 0, 0
+        empty = _Decided(none, problem, nothing, shapes(d, none, np.zeros((0, 4, 4)), 0), 0)
+        return empty, replace(graph.solve(problem, config.estimate), tree=none), 0
     a = _Association(problem, track, config)
     end = float(problem.motion.distance[-1])
     cap = _gnss_cap(problem, a.closer)
@@ -287,16 +303,16 @@ def _associate_and_solve(
         a.tree_of_track = refine(t, a.tree_of_track, config.trees, patience)
         estimate = a.solve(estimate, patient=True)
     progress("solve", 0.0)
-    decided = a.decide(estimate)
+    after = a.decide(estimate)
     for n in range(LAST_ROUNDS):
-        tree, problem, existence, rejected = decided
-        estimate = replace(graph.solve(problem, config.estimate), tree=tree)
+        decided = after
+        estimate = replace(graph.solve(decided.problem, config.estimate), tree=decided.tree)
         progress("solve", (n + 1) / LAST_ROUNDS)
-        decided = a.decide(estimate)
-        if np.array_equal(decided[0], tree):
+        after = a.decide(estimate)
+        if np.array_equal(after.tree, decided.tree):
             break
     progress("solve", 1.0)
-    return tree, problem, estimate, existence, rejected, a.closer.loops
+    return decided, estimate, a.closer.loops
 
 
 LAST_ROUNDS = 4
@@ -350,6 +366,7 @@ def topo_map(solved: Solved, config: Config, meta: dict[str, str]) -> TopoMap:
         in_order(solved.run.trunks),
         map_T_scans(solved),
         solved.existence,
+        solved.shapes,
         solved.problem.datum,
         config.topomap,
         meta,
@@ -383,6 +400,7 @@ def baseline(solved: Solved, config: Config) -> tuple[Estimate, TopoMap]:
         [],
         poses,
         all_trees,
+        solved.shapes.select(keep),
         solved.problem.datum,
         config.topomap,
         {"method": "thesis"},

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
 from topograph.geometry import Array
 from topograph.simulate.config import OrchardConfig
@@ -95,10 +96,12 @@ class Build:
             self.cylinder(foot + middle * axis, upper, max(fork - middle, 0.1) + 0.3, 0.97 * r, 0.85 * r, TRUNK, number)
         if config.flare > 0:
             self.cylinder(sunk, axis, 0.3 + 0.45, (1.1 + config.flare) * r, 1.08 * r, TRUNK, number)
+        outline = [np.array([0.0, 0.0, r])]
         if config.lobes > 0 and rng.random() < config.lobes:  # ribs: the trunk's outline is no circle
             for a in rng.uniform(0, 2 * np.pi, int(rng.integers(1, 4))):
                 out = 0.35 * r * np.array([np.cos(a), np.sin(a), 0.0])
                 self.cylinder(sunk + out, axis, min(fork, 1.6) + 0.3, 0.85 * r, 0.7 * r, TRUNK, number)
+                outline.append(np.array([out[0], out[1], 0.77 * r]))
         for _ in range(config.branches):  # stubs and dead branches on the bare trunk
             h = rng.uniform(0.3, max(fork, 0.5))
             d = self.direction(0.3) - [0, 0, 1.0] + 1.5 * np.array([*rng.normal(0, 1, 2), 0.0])
@@ -114,7 +117,8 @@ class Build:
                 base = self.foot(np.asarray(xy) + far * np.array([np.cos(a), np.sin(a)]))
                 self.cylinder(base, self.direction(0.25), rng.uniform(0.3, 1.0), 0.008, 0.006, LEAF)
             self.blobs.append([*(foot + [0, 0, 0.25]), 0.3, 0.3, 0.3, rng.uniform(0.3, 1.2), LEAF, -1])
-        return foot, axis, 2 * r, stems
+        middle_of, diameter = _girth(np.array(outline))
+        return foot + [*middle_of, 0.0], axis, diameter, stems
 
     def _bent(
         self, config: OrchardConfig, foot: Array, axis: Array, r: float, fork: float, number: int
@@ -266,6 +270,18 @@ class Build:
         return np.array(
             [[*self._anywhere(places, 1.5), *(self.rng.normal(0, 0.5, 2))] for _ in range(config.walkers)]
         ).reshape(-1, 4)
+
+
+def _girth(circles: Array) -> tuple[Array, float]:
+    """Centre (2,) of the area that circles (K, 3) x, y, radius cover together, and the diameter that a tape around them reads."""
+    if len(circles) == 1:
+        return circles[0, :2], 2.0 * float(circles[0, 2])
+    reach = np.abs(circles[:, :2]).max() + circles[:, 2].max()
+    grid = np.stack(np.meshgrid(*2 * [np.linspace(-reach, reach, 101)]), axis=-1).reshape(-1, 2)
+    inside = (np.linalg.norm(grid[:, None] - circles[None, :, :2], axis=2) < circles[:, 2]).any(axis=1)
+    turn = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    rim = circles[:, None, :2] + circles[:, None, 2:] * np.stack([np.cos(turn), np.sin(turn)], axis=1)[None]
+    return grid[inside].mean(axis=0), float(ConvexHull(rim.reshape(-1, 2)).area / np.pi)
 
 
 def person(foot: Array, turn: float) -> list[list[float]]:

@@ -14,7 +14,7 @@ from topograph.topomap.clouds import register
 from topograph.topomap.edges import TopomapConfig, among
 from topograph.topomap.map import TREE, TopoMap, Viewpoint
 from topograph.topomap.rows import find_rows
-from topograph.trees import Detections, Existence, shapes
+from topograph.trees import Detections, Existence, Shapes
 
 
 def build(
@@ -23,17 +23,19 @@ def build(
     trunks: Sequence[Trunks],
     map_T_scan: Array,
     existence: Existence,
+    s: Shapes,
     datum: Datum | None,
     config: TopomapConfig,
     meta: dict[str, str],
 ) -> TopoMap:
-    """The map of an estimate. `trunks` are the scans' trunks with their clouds; `detections.source` counts in them."""
+    """The map of an estimate, whose trees have shapes `s`. `trunks` are the scans' trunks with their clouds;
+    `detections.source` counts in them.
+    """
     n, tree = len(estimate.trees), estimate.tree
-    s = shapes(detections, tree, map_T_scan, n)
     foot = estimate.trees - s.axis * (s.height / np.maximum(s.axis[:, 2], 0.3))[:, None]
     cov = estimate.tree_cov.copy()
     # The foot lies `height` below what was measured: the lean's error carries over.
-    cov[:, [0, 1], [0, 1]] += (s.height**2 * s.slope_var + _no_cylinder(s.diameter) ** 2)[:, None]
+    cov[:, [0, 1], [0, 1]] += (s.place_var + s.height**2 * s.slope_var + _no_cylinder(s.diameter) ** 2)[:, None]
     viewpoints = _viewpoints(foot, tree, detections, trunks, map_T_scan, config)
     is_tree = existence.kind == TREE
     edges = among(foot[:, :2], is_tree, config)

@@ -26,8 +26,10 @@ STILL = 0.6
 """Parts of a landmark's sightings lie no further apart in the solved map, m: half of a thick trunk."""
 NEAR = 5.0
 """Range at which a sighting tells half as much of what a thing is as one at arm's length, m."""
-DOUBTFUL = 0.25
-"""Log-odds below which nothing is a tree, where the run's trees are hardly told from the rest: see `TreesConfig.usual_score`."""
+DOUBTFUL = 0.4
+"""Log-odds by which a tree may fall short of its share of the run's usual score, see `TreesConfig.usual_score`."""
+RARE = 2.5
+"""Log-odds that a tree seen once would need beyond that; the demand falls with the root of the sightings."""
 BLOCK = 100_000
 """Pairs of scans and trees that are looked at together."""
 REACH = 31.0
@@ -90,7 +92,10 @@ def exists(
     if (d.score[used] != 0.0).any():  # recorded detections may come without
         # Scores differ between sensors and orchards: what counts is also how this run's own trees score.
         surely = ok & (kind == TREE)
-        ok &= (kind != TREE) | (score >= config.usual_score * _usual(score[surely], hits[surely]) - DOUBTFUL)
+        demand = (
+            config.usual_score * _usual(score[surely], hits[surely]) - DOUBTFUL + RARE / np.sqrt(np.maximum(hits, 1))
+        )
+        ok &= (kind != TREE) | (score >= demand)
     return Existence(ok=ok & (kind != OTHER), kind=kind, probability=probability, score=score, hits=hits, passed=passed)
 
 

@@ -14,16 +14,24 @@ LEAN_PRIOR = 0.12
 """Sigma of a trunk's lean from the vertical, rad (per axis)."""
 DIAMETER_PRIOR = (0.22, 0.25)
 """Mean and sigma of diameters, m: wide, since orchards differ more than trees of one."""
-ALIKE = 0.1
+ALIKE = 0.3
 """Share of a sighting's information that is its own: the next scan sees the same bark from nearly the same side."""
+VIEWS = 8
+"""Sectors of the compass a tree is seen from: what is wrong with a view is wrong with all sightings of it."""
+USUAL_VIEWS = 4.0
+"""Views' worth of the run's other trees in what a tree's own views say of how far they disagree."""
+VIEW_SIGMA, VIEW_LEAN = 0.01, 0.03
+"""Disagreement of views that is there before any was seen: of places, m, and of slopes, rad."""
 BEND = 0.012
 """A trunk's axis below what was seen is not the axis seen, rad."""
 FORK = 0.4
 """Height above ground at which the stems of one tree are taken to part, m."""
-APART = 0.12
-"""Share of sightings that must see two stems; of single trunks up to 9 % do, by a branch."""
-FORKED_LEAN = 0.08
-"""Sigma of the lean below the fork, which no stem shows, rad."""
+APART = 0.2
+"""Share of sightings that must see two stems; of single trunks up to a tenth do, by a branch, in dense rows up to a fifth."""
+FORKED_LEAN = 0.1
+"""Sigma of the lean below the fork about the mean of the stems, rad."""
+MOST_STEMS = 3
+"""That can be told apart by their places."""
 STATED_PRIOR = 0.12
 """Sigma of the lean's prior within a sighting's stated axis (trunks/fit.py), rad."""
 LEVER, SLOPE_X, SLOPE_Y, SLOPE_WEIGHT, WIDE, WIDE_SIGMA = range(6)
@@ -38,6 +46,8 @@ class Shapes:
         diameter: (T,) m or NaN; `diameter_sigma` (T,).
         height: (T,) above ground of the point that the sightings state, m.
         stems: (T,).
+        place_var: (T,) of the axis at that height, from how far views from different sides disagree, m².
+        own_slope: (N, 2) slope of the stem that each of the N sightings saw, where its tree has several; else NaN.
     """
 
     slope: Array
@@ -46,6 +56,13 @@ class Shapes:
     diameter_sigma: Array
     height: Array
     stems: NDArray[np.int64]
+    place_var: Array
+    own_slope: Array
+
+    def select(self, keep: NDArray[np.bool_]) -> Shapes:
+        """The trees where `keep` (T,)."""
+        per_tree = ("slope", "slope_var", "diameter", "diameter_sigma", "height", "stems", "place_var")
+        return replace(self, **{k: getattr(self, k)[keep] for k in per_tree})
 
     @property
     def axis(self) -> Array:
@@ -54,8 +71,10 @@ class Shapes:
         return np.asarray(a / np.linalg.norm(a, axis=1, keepdims=True))
 
 
-def shapes(detections: Detections, tree: NDArray[np.int64], map_T_scan: Array, n: int) -> Shapes:
-    """Shapes of `n` trees; `tree` (N,) of each detection or -1."""
+def shapes(
+    detections: Detections, tree: NDArray[np.int64], map_T_scan: Array, n: int, whole: NDArray[np.int64] | None = None
+) -> Shapes:
+    """Shapes of `n` trees; `tree` (N,) of each detection or -1. Trees `whole` are of one stem, whatever was seen."""
     d = detections
     order = np.argsort(tree, kind="stable")
     ends = np.searchsorted(tree[order], np.arange(n + 1))
@@ -71,19 +90,119 @@ def shapes(detections: Detections, tree: NDArray[np.int64], map_T_scan: Array, n
         diameter_sigma=np.full(n, np.nan),
         height=np.zeros(n),
         stems=np.ones(n, np.int64),
+        place_var=np.zeros(n),
+        own_slope=np.full((len(d), 2), np.nan),
     )
+    at_height, middle, lever = _places(d, map_T_scan)
+    views = _views(d, map_T_scan, middle)
+    trust = 1.0 / np.maximum(0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1]), 1e-6)
+    places, slopes = _Views(n, VIEW_SIGMA), _Views(n, VIEW_LEAN)
     for j in range(n):
         mine = order[ends[j] : ends[j + 1]]
         if not len(mine):
             continue
-        out.slope[j], out.slope_var[j] = _together(slope[mine], weight[mine])
         out.diameter[j], out.diameter_sigma[j] = _thickness(d, mine)
         above = d.height[mine][np.isfinite(d.height[mine])]
         out.height[j] = np.median(above) if len(above) and measured else common
-        out.stems[j] = _stems(d, mine)
+        if whole is None or j not in whole:
+            out.stems[j] = _stems(d, mine)
         if out.stems[j] > 1:
-            out.slope_var[j] = max(out.slope_var[j], FORKED_LEAN**2)
+            out.slope[j], own = _forked(at_height[mine], slope[mine], weight[mine], int(out.stems[j]))
+            out.slope_var[j], out.own_slope[mine], out.height[j] = FORKED_LEAN**2, own, FORK
+            place = middle[mine] - (d.height[mine] - lever[mine] - FORK)[:, None] * own
+        else:
+            out.slope[j], v = _together(slope[mine], weight[mine])
+            out.slope_var[j] = 1.0 / (v.sum() + 1.0 / LEAN_PRIOR**2)
+            slopes.add(j, slope[mine] - out.slope[j], v, views[mine])
+            place = middle[mine] + lever[mine, None] * out.slope[j]
+        places.add(j, place - np.median(place, axis=0), trust[mine], views[mine])
+    if measured:
+        single = out.stems == 1
+        out.slope_var[single] = np.minimum(out.slope_var + BEND**2 + slopes.variance(), LEAN_PRIOR**2)[single]
+        out.place_var[:] = places.variance()
+    else:
+        out.slope_var[:] += BEND**2
     return out
+
+
+def _places(d: Detections, map_T_scan: Array) -> tuple[Array, Array, Array]:
+    """Where each sighting states its trunk, (N, 2) in the map, where it measured it, (N, 2), and how far below that is, (N,) m."""
+    lever = d.measured[:, LEVER]
+    if not len(d):
+        return np.zeros((0, 2)), np.zeros((0, 2)), lever
+    T = map_T_scan[d.scan]
+    below = d.p - (lever / np.maximum(d.axis[:, 2], 0.3))[:, None] * d.axis
+    return transform(T, d.p)[:, :2], transform(T, below)[:, :2], lever
+
+
+def _views(d: Detections, map_T_scan: Array, place: Array) -> NDArray[np.int64]:
+    """Sector (N,) of the compass in which the robot stood, seen from what it sighted at `place` (N, 2)."""
+    if not len(d):
+        return np.zeros(0, np.int64)
+    away = map_T_scan[d.scan, :2, 3] - place
+    turn = (np.arctan2(away[:, 1], away[:, 0]) + np.pi) / (2 * np.pi)
+    return np.minimum((turn * VIEWS).astype(np.int64), VIEWS - 1)
+
+
+class _Views:
+    """How far the means of views disagree, tree by tree, drawn towards the run's other trees where a tree shows few sides:
+    a cluster-robust variance (Liang & Zeger 1986) with a prior.
+    """
+
+    def __init__(self, n: int, least: float) -> None:
+        self.least = least
+        self.square, self.count, self.share = np.zeros(n), np.zeros(n), np.ones(n)
+
+    def add(self, tree: int, residual: Array, weight: Array, view: NDArray[np.int64]) -> None:
+        """Residuals (M, 2) of a tree's sightings about its mean, their weights and views (M,)."""
+        total = np.bincount(view, weight, VIEWS)
+        if total.sum() <= 0:
+            return
+        centre = weight @ residual / total.sum()
+        seen = np.flatnonzero(total > 0)
+        share = total[seen] / total.sum()
+        apart = [np.bincount(view, weight * (residual[:, k] - centre[k]), VIEWS)[seen] / total[seen] for k in (0, 1)]
+        # A view's mean is nearer to the tree's the more it has made it.
+        free = np.maximum(1.0 - share, 0.0)
+        self.square[tree] = 0.5 * float((share * len(share)) @ (apart[0] ** 2 + apart[1] ** 2))
+        self.count[tree] = float((share * len(share)) @ free)
+        self.share[tree] = float(np.sum(share**2))
+
+    def variance(self) -> Array:
+        """(T,) of the trees' means."""
+        usual = (self.square.sum() + USUAL_VIEWS * self.least**2) / (self.count.sum() + USUAL_VIEWS)
+        own = (self.square + USUAL_VIEWS * usual) / (self.count + USUAL_VIEWS)
+        return np.asarray(own * self.share)
+
+
+def _forked(place: Array, slope: Array, weight: Array, stems: int) -> tuple[Array, Array]:
+    """Slope (2,) of a tree of several stems, the mean of theirs, and the slope (M, 2) of the stem that each sighting saw.
+
+    Stems lean away from each other about the axis below them; one that is seen more often must not pull it to its side.
+    """
+    group = _groups(place, min(stems, MOST_STEMS))
+    own = np.zeros((len(place), 2))
+    found = []
+    for g in np.unique(group):
+        rows = group == g
+        own[rows] = _together(slope[rows], weight[rows])[0]
+        if rows.mean() > 0.1:
+            found.append(own[rows][0])
+    return np.mean(found, axis=0), own
+
+
+def _groups(place: Array, k: int) -> NDArray[np.int64]:
+    """Group (M,) of places (M, 2) by Lloyd's algorithm, started from the points that lie furthest apart."""
+    centres = [place[np.argmax(np.linalg.norm(place - np.median(place, axis=0), axis=1))]]
+    while len(centres) < k:
+        near = np.min([np.linalg.norm(place - c, axis=1) for c in centres], axis=0)
+        centres.append(place[np.argmax(near)])
+    middle = np.array(centres)
+    group = np.zeros(len(place), np.int64)
+    for _ in range(10):
+        group = np.linalg.norm(place[:, None] - middle[None], axis=2).argmin(axis=1)
+        middle = np.array([np.median(place[group == g], axis=0) if (group == g).any() else middle[g] for g in range(k)])
+    return np.asarray(group)
 
 
 def _slopes(d: Detections, map_T_scan: Array) -> tuple[Array, Array]:
@@ -102,22 +221,18 @@ def _slopes(d: Detections, map_T_scan: Array) -> tuple[Array, Array]:
     return turned[:, :2] / flat[:, None], np.where(np.abs(turned[:, :2]).max(axis=1) < flat, weight, 0.0)
 
 
-def _together(slope: Array, weight: Array) -> tuple[Array, float]:
-    """Mean slope (2,) with the prior, robust to sightings of something else, and its variance."""
+def _together(slope: Array, weight: Array) -> tuple[Array, Array]:
+    """Mean slope (2,) with the prior, robust to sightings of something else, and the weight (M,) that each was given."""
     prior = 1.0 / LEAN_PRIOR**2
     if weight.sum() <= 0:
-        return np.zeros(2), LEAN_PRIOR**2
+        return np.zeros(2), np.zeros(len(weight))
     w = ALIKE * np.minimum(weight, 1.0 / 0.03**2)
     mean = np.asarray(w @ slope / w.sum())
     for _ in range(4):
         e2 = np.sum((slope - mean) ** 2, axis=1)
         v = w / (1.0 + e2 / (1.0 / np.maximum(weight, 1e-9) + 0.06**2))
         mean = np.asarray(v @ slope / v.sum())
-    e2 = np.sum((slope - mean) ** 2, axis=1)
-    spread = float(v @ e2 / v.sum()) / 2.0  # stems and bends: the views do not agree on one axis
-    total = float(v.sum())
-    var = 1.0 / (total + prior) + BEND**2 + 0.15 * spread * (total / (total + prior))
-    return np.asarray(mean * total / (total + prior)), min(var, LEAN_PRIOR**2)
+    return np.asarray(mean * v.sum() / (v.sum() + prior)), v
 
 
 def _thickness(d: Detections, mine: NDArray[np.int64]) -> tuple[float, float]:
@@ -156,7 +271,7 @@ def relevelled(detections: Detections, tree: NDArray[np.int64], map_T_scan: Arra
     d = detections
     own = np.flatnonzero(tree >= 0)
     several = s.stems[tree[own]] > 1
-    return _at_the_fork(_along(d, tree, own[~several], map_T_scan, s), own[several])
+    return _at_the_fork(_along(d, tree, own[~several], map_T_scan, s), own[several], map_T_scan, s)
 
 
 def _along(d: Detections, tree: NDArray[np.int64], rows: NDArray[np.int64], map_T_scan: Array, s: Shapes) -> Detections:
@@ -175,16 +290,20 @@ def _along(d: Detections, tree: NDArray[np.int64], rows: NDArray[np.int64], map_
     return replace(d, p=p, cov=cov)
 
 
-def _at_the_fork(d: Detections, rows: NDArray[np.int64]) -> Detections:
-    """Rows of `d` stated where the stems of a tree part."""
+def _at_the_fork(d: Detections, rows: NDArray[np.int64], map_T_scan: Array, s: Shapes) -> Detections:
+    """Rows of `d` stated where the stems of a tree part, each along the stem that it saw."""
     rows = rows[np.isfinite(d.height[rows])]
     if not len(rows):
         return d
     p, cov, height = d.p.copy(), d.cov.copy(), d.height.copy()
     down = d.height[rows] - FORK
-    p[rows] -= down[:, None] * d.axis[rows] / np.maximum(d.axis[rows, 2:], 0.3)
-    height[rows] = FORK
     lever = d.measured[rows, LEVER]
+    # What was measured lies `lever` below what is stated, along one scan's guess of the axis.
+    p[rows] -= lever[:, None] * d.axis[rows] / np.maximum(d.axis[rows, 2:], 0.3)
+    along = np.concatenate([s.own_slope[rows], np.ones((len(rows), 1))], axis=1)
+    T = map_T_scan[d.scan[rows]]
+    p[rows] = transform(inverse(T), transform(T, p[rows]) - (down - lever)[:, None] * along)
+    height[rows] = FORK
     _widen(cov, rows, ((lever - down) ** 2 - lever**2) * _stated_lean_var(d, rows))
     return replace(d, p=p, cov=cov, height=height)
 

@@ -73,18 +73,18 @@ def candidates(
     R = base_T_lidar[:3, :3]
     ring, tangent = rings_of(scan, bool(R[2, 2] < 0))
     offset = _NO_TIME if scan.offset is None else scan.offset
-    p, r, starts, low = organise(
+    p, r, u, starts, low = organise(
         scan.xyz, ring, offset, base_T_lidar, twist, len(tangent), config.nearest, config.farthest + 8.0
     )
     if len(p) < 50:
         return _NOTHING
     eye = base_T_lidar[:3, 3].copy()
-    step = angular_step(p, r, eye, starts)
+    step = angular_step(u, starts)
     plane, grid = fit_ground(low)
     h, above, beside = heights(p, plane, grid)
-    runs, label = find_runs(p, r, h, starts, eye, step, config.low, config.high, config.widest)
+    runs, label = find_runs(p, r, u, h, starts, step, config.low, config.high, config.widest)
     chain = link(runs)
-    near, slope = ring_image(p, r, starts, eye)
+    near, slope = ring_image(p, r, u, starts, eye)
     if up is None:
         up = vertical(runs, chain, 64)
     heads, order, ends = members(chain)

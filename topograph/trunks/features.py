@@ -32,6 +32,7 @@ from topograph.trunks.passage import (
     TRUNK_HIT,
     TRUNK_PASS,
     TRUNK_RINGS,
+    crossings,
     look_at,
 )
 from topograph.trunks.patch import HIGH_NAMES, PATCH_NAMES, PATCH_SIZE, look_at_patch
@@ -57,7 +58,7 @@ OVERHEAD = (
     _TRUNK_PASSED, _TRUNK_MET, _AXIS_MET, _AXIS_SEEN, _CROWN, _CROWN_SEEN, _TOP,
     _CANOPY, _OVERHEAD, _COVERED_NEAR, _COVERED,
 ) = range(32)  # fmt: skip
-_PATCH = len(FEATURES) - PATCH_SIZE
+_COUNT, _PATCH = len(FEATURES), len(FEATURES) - PATCH_SIZE
 BEHIND = 0.25
 """A return so far behind a run, between its ends, went through it, m."""
 
@@ -65,7 +66,8 @@ BEHIND = 0.25
 @njit(cache=True)
 def describe(p, r, runs, label, order, ends, fits, name, near, tangent, R, eye, above, beside, up, step):
     """Features (C, len(FEATURES)) of the trunks `fits` (C, OUT_SIZE)."""
-    out = np.zeros((len(fits), len(FEATURES)))
+    out = np.zeros((len(fits), _COUNT))
+    crossed = np.empty((len(tangent), 4))
     for c in range(len(fits)):
         a, f = fits[c], out[c]
         mine = order[ends[name[c]] : ends[name[c] + 1]]
@@ -79,8 +81,9 @@ def describe(p, r, runs, label, order, ends, fits, name, near, tangent, R, eye, 
         _ladder(runs, mine, highest - lowest, f)
         _surface(p, r, runs, label, mine, a, lx, ly, radius, f)
         _around(above, beside, a, lx, ly, radius, f)
-        _beams(near, tangent, R, eye, a, lx, ly, radius, highest, f)
-        look_at_patch(near, tangent, R, eye, a[X], a[Y], a[Z], lx, ly, a[Z] - a[ABOVE], radius, f[_PATCH:])
+        if crossings(tangent, R, eye, a[X], a[Y], a[Z], lx, ly, crossed):
+            _beams(near, crossed, a[Z] - a[ABOVE], radius, highest, f)
+            look_at_patch(near, crossed, a[Z] - a[ABOVE], radius, f[_PATCH:])
     return out
 
 
@@ -155,10 +158,10 @@ def _around(above, beside, a, lx, ly, radius, f):
 
 
 @njit(cache=True)
-def _beams(near, tangent, R, eye, a, lx, ly, radius, highest, f):
+def _beams(near, crossed, ground, radius, highest, f):
     """What the beams say that did not hit it: see `look_at`."""
     seen = np.zeros(SEEN_SIZE)
-    look_at(near, tangent, R, eye, a[X], a[Y], a[Z], lx, ly, a[Z] - a[ABOVE], radius, highest, seen)
+    look_at(near, crossed, ground, radius, highest, seen)
     f[_TRUNK_PASSED] = seen[TRUNK_PASS] / max(seen[TRUNK_HIT] + seen[TRUNK_PASS], 1.0)
     f[_TRUNK_MET] = seen[TRUNK_HIT] / max(seen[TRUNK_RINGS], 1.0)
     looked = seen[AXIS_HIT] + seen[AXIS_PASS]

@@ -24,6 +24,11 @@ ALIKE = 6.0
 """Returns of one ring share their error: so many count as one."""
 STRAIGHT, BENDS = 0.9, 0.25
 """Height up to which a trunk is taken for straight, and over which it may bend, m."""
+TAPER = 0.12
+"""A trunk's radius shrinks by this share per metre upwards: butts are swollen. Unheeded, trunks seem to lean away from where
+they are seen from."""
+CHEST = 0.8
+"""Height at which the radius is that of the diameter, m."""
 PUSH = 0.83
 """The mean return of a cylinder lies π/4 of its radius before the axis; mixed pixels at the edges take away the rest."""
 
@@ -122,7 +127,7 @@ def axis_of(runs, mine, w, mean_width, radius, eye, step, far, up, row):
         i = mine[q]
         dx, dy = runs[i, PX] - eye[0], runs[i, PY] - eye[1]
         d = np.sqrt(dx * dx + dy * dy)
-        push = PUSH * radius
+        push = PUSH * radius * (1.0 - TAPER * (runs[i, HEIGHT] - CHEST))
         cx[q], cy[q], cz[q] = runs[i, PX] + dx / d * push, runs[i, PY] + dy / d * push, runs[i, PZ]
         # A ring that is much wider or narrower than the others is partly hidden, or not only trunk.
         odd = (w[q] - mean_width) / (0.05 + step * far)
@@ -147,8 +152,11 @@ def axis_of(runs, mine, w, mean_width, radius, eye, step, far, up, row):
             szy += cw[q] * dz * (cy[q] - ym)
         lx, ly = (szx + prior * up[0]) / (szz + prior), (szy + prior * up[1]) / (szz + prior)
         if turn == 0:
+            # What is odd is judged against what was measured: against the prior, the ends of a leaning trunk were odd.
+            free = 0.1 * prior
+            mx, my = (szx + free * up[0]) / (szz + free), (szy + free * up[1]) / (szz + free)
             for q in range(n):
-                ex, ey = cx[q] - xm - lx * (cz[q] - zm), cy[q] - ym - ly * (cz[q] - zm)
+                ex, ey = cx[q] - xm - mx * (cz[q] - zm), cy[q] - ym - my * (cz[q] - zm)
                 cw[q] /= 1.0 + (ex * ex + ey * ey) / 0.06**2
     line2 = 0.0
     for q in range(n):

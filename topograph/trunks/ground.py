@@ -7,6 +7,9 @@ from numba import njit
 
 from topograph.trunks.organise import FAST, HALF
 
+DIFFUSED = 12
+"""Steps by which ground that was seen spreads into what was not: about as many metres."""
+
 
 @njit(cache=True, fastmath=FAST)
 def fit_ground(low):
@@ -97,15 +100,18 @@ def fit_ground(low):
         for j in range(size):
             if not valid[i, j]:
                 grid[i, j] = 0.0
-    quarter, keep, fade = np.float32(0.25), np.float32(0.75), np.float32(0.985)
-    for _ in range(8):
+    share, around = np.zeros((size, size), np.float32), np.zeros((size, size), np.float32)
+    for i in range(1, size - 1):
+        for j in range(1, size - 1):
+            around[i, j] = 0.25 * 0.25 if valid[i, j] else 0.25 * 0.985
+            share[i, j] = 0.75 if valid[i, j] else 0.0
+    other = grid.copy()
+    for _ in range(DIFFUSED):
         for i in range(1, size - 1):
             for j in range(1, size - 1):
-                around = quarter * (grid[i - 1, j] + grid[i + 1, j] + grid[i, j - 1] + grid[i, j + 1])
-                if valid[i, j]:
-                    grid[i, j] = keep * grid[i, j] + quarter * around
-                else:
-                    grid[i, j] = fade * around
+                sides = grid[i - 1, j] + grid[i + 1, j] + grid[i, j - 1] + grid[i, j + 1]
+                other[i, j] = share[i, j] * grid[i, j] + around[i, j] * sides
+        grid, other = other, grid
     return plane, grid
 
 

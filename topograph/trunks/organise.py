@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from topograph.bags import Scan
 from topograph.geometry import Array
 
+FAST = {"contract", "reassoc", "arcp", "nsz"}
+"""Liberties with floating point that keep the meaning of NaN."""
 HALF = 32
 """Ground cells of 1 m in each direction from the base."""
 
@@ -22,35 +24,42 @@ def rings_of(scan: Scan, flipped: bool = False) -> tuple[NDArray[np.int32], Arra
     """
     xyz = scan.xyz
     ring = scan.ring
-    if ring is None or not len(ring) or ring.min() < 0 or ring.max() >= 512:
+    if ring is None or not len(ring) or ring.min() < 0 or ring.max() >= MOST_RINGS:
         ring = _clusters(xyz)
-    count = np.bincount(ring)
-    total, n = _rise(xyz, ring, len(count), slice(None, None, SAMPLE))
-    if (n[count > 0] < 3).any():
-        total, n = _rise(xyz, ring, len(count), slice(None))
+    full, total, n = _rise(xyz, ring, int(ring.max()) + 1, SAMPLE)
+    if (n[full > 0] < 3).any():
+        _, total, n = _rise(xyz, ring, len(n), 1)
     tangent = total / np.maximum(n, 1)
     tangent[n == 0] = np.inf  # nothing was returned: no place among the others
     order = np.argsort(-tangent if flipped else tangent, kind="stable")
-    rank = np.empty(len(count), np.int32)
-    rank[order] = np.arange(len(count))
-    full = int((n > 0).sum())
+    rank = np.empty(len(n), np.int32)
+    rank[order] = np.arange(len(n))
+    some = int((n > 0).sum())
     if flipped:  # rings without returns came first
-        order, rank = order[len(count) - full :], rank - (len(count) - full)
-    out = ring if np.array_equal(rank, np.arange(len(count))) else rank[ring]
-    return out.astype(np.int32, copy=False), tangent[order[:full]]
+        order, rank = order[len(n) - some :], rank - (len(n) - some)
+    out = ring if np.array_equal(rank, np.arange(len(n))) else rank[ring]
+    return out.astype(np.int32, copy=False), tangent[order[:some]]
 
 
+MOST_RINGS = 512
+"""A ring field with more than this is none."""
 SAMPLE = 7
 """Every so-manieth point tells a ring's elevation; no divisor of the usual numbers of lasers, which fire in turn."""
 
 
-def _rise(xyz: NDArray[np.float32], ring: NDArray[np.int32], n: int, some: slice) -> tuple[Array, NDArray[np.int64]]:
-    """Sum of tangents of elevation and their number, (n,), by ring."""
-    x, y, z, k = xyz[some, 0], xyz[some, 1], xyz[some, 2], ring[some]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        t = z / np.sqrt(x * x + y * y)
-    ok = np.isfinite(t)
-    return np.asarray(np.bincount(k[ok], t[ok], n), float), np.bincount(k[ok], minlength=n).astype(np.int64)
+@njit(cache=True)
+def _rise(xyz, ring, n, every):
+    """Points (n,) of each ring; sum of tangents of elevation and their number, (n,), of every so-manieth point."""
+    full, count, total = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n)
+    for i in range(len(ring)):
+        full[ring[i]] += 1
+    for i in range(0, len(ring), every):
+        x, y = xyz[i, 0], xyz[i, 1]
+        t = xyz[i, 2] / np.sqrt(x * x + y * y)
+        if np.isfinite(t):
+            total[ring[i]] += t
+            count[ring[i]] += 1
+    return full, total, count
 
 
 def _clusters(xyz: NDArray[np.float32]) -> NDArray[np.int32]:
@@ -86,14 +95,11 @@ def once(scan: Scan) -> Scan:
     return Scan(scan.stamp_ns, scan.frame, scan.xyz[:half], ring, offset, intensity)
 
 
-FAST = {"contract", "reassoc", "arcp", "nsz"}
-"""Liberties with floating point that keep the meaning of NaN."""
-
-
 @njit(cache=True, fastmath=FAST)
 def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
-    """Points in ring order: base-frame xyz (M, 3), horizontal range from the sensor (M,), ring starts (R+1,), and the
-    lowest point (2 HALF, 2 HALF) of each ground cell. A point that repeats the one before it in its ring is dropped.
+    """Points in ring order: base-frame xyz (M, 3), horizontal range from the sensor (M,), horizontal direction from it (M, 2),
+    ring starts (R+1,), and the lowest point (2 HALF, 2 HALF) of each ground cell. A point that repeats the one before it in
+    its ring is dropped.
 
     `offset` (N,) s or empty; `twist` (6,) of the base. First the motion during the sweep is taken out, to second
     order in the sweep's time; then the points are where they were at the stamp, seen from the base then.
@@ -130,6 +136,7 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
     m = count[n_rings]
     p = np.empty((m, 3), np.float32)
     r = np.empty(m, np.float32)
+    u = np.empty((m, 2), np.float32)
     fill = count[:-1].copy()
     before[:] = 0.0
     turns = np.zeros((n_rings, 2), np.int64)
@@ -161,7 +168,10 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
             bz += t * uz + h * (wx * uy - wy * ux)
         p[k, 0], p[k, 1], p[k, 2] = bx, by, bz
         ex, ey = bx - tx, by - ty
-        r[k] = np.sqrt(ex * ex + ey * ey)
+        far = np.sqrt(ex * ex + ey * ey)
+        one = np.float32(1.0) / max(far, np.float32(1e-6))
+        r[k] = far
+        u[k, 0], u[k, 1] = ex * one, ey * one
         cx, cy = int(bx + HALF), int(by + HALF)
         if bx > -HALF and by > -HALF and cx < 2 * HALF and cy < 2 * HALF and bz < low[cx, cy]:
             low[cx, cy] = bz
@@ -172,29 +182,29 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
         # Firing order is azimuth order but for the place where the turn closes; anything else is sorted. A ring that
         # comes round more than twice is several in one.
         if min(turns[k, 0], turns[k, 1]) > 2 + (hi - lo) // 200 or rounds[k] > 3:
-            order = np.argsort(np.arctan2(p[lo:hi, 1] - ty, p[lo:hi, 0] - tx))
+            order = np.argsort(np.arctan2(u[lo:hi, 1], u[lo:hi, 0]))
             p[lo:hi] = p[lo:hi][order]
             r[lo:hi] = r[lo:hi][order]
-    return p, r, starts, low
+            u[lo:hi] = u[lo:hi][order]
+    return p, r, u, starts, low
 
 
-@njit(cache=True)
-def angle_between(p, r, eye, i, j):
+@njit(cache=True, fastmath=FAST)
+def angle_between(u, i, j):
     """Angle (sine of it) between two points of a ring as the sensor sees them."""
-    ax, ay, bx, by = p[i, 0] - eye[0], p[i, 1] - eye[1], p[j, 0] - eye[0], p[j, 1] - eye[1]
-    return abs(ax * by - ay * bx) / (r[i] * r[j])
+    return abs(u[i, 0] * u[j, 1] - u[i, 1] * u[j, 0])
 
 
 @njit(cache=True)
-def angular_step(p, r, eye, starts):
+def angular_step(u, starts):
     """Angle between neighbouring firings, rad: the commonest small step within rings, from a sample of them."""
-    m = p.shape[0]
+    m = u.shape[0]
     every = max(1, m // 1200)
     out = np.empty(m // every + len(starts))
     n = 0
     for k in range(len(starts) - 1):
         for i in range(starts[k], starts[k + 1] - 1, every):
-            a = angle_between(p, r, eye, i, i + 1)
+            a = angle_between(u, i, i + 1)
             if 2e-4 < a < 0.05:
                 out[n] = a
                 n += 1

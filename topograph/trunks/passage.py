@@ -40,22 +40,26 @@ def bin_of(x, y):
 
 
 @njit(cache=True, fastmath=FAST)
-def ring_image(p, r, starts, eye):
+def ring_image(p, r, u, starts, eye):
     """Nearest horizontal range (R, BINS) of what each ring met in each direction (0: no return), and the slope
     (R, BINS) of the beam that met it, metres of height per metre.
     """
     rings = starts.shape[0] - 1
     near = np.zeros((rings, BINS), np.float32)
     slope = np.zeros((rings, BINS), np.float32)
-    ex, ey, ez = np.float32(eye[0]), np.float32(eye[1]), np.float32(eye[2])
-    zero, two, four, scale = np.float32(0.0), np.float32(2.0), np.float32(4.0), np.float32(BINS / 4.0)
+    ez, zero, two, four, scale = (
+        np.float32(eye[2]),
+        np.float32(0.0),
+        np.float32(2.0),
+        np.float32(4.0),
+        np.float32(BINS / 4.0),
+    )
     for k in range(rings):
         for i in range(starts[k], starts[k + 1]):
-            x, y = p[i, 0] - ex, p[i, 1] - ey
-            a = abs(x) + abs(y)
-            if not a > zero:  # NaN too
+            x, y = u[i, 0], u[i, 1]
+            t = y / (abs(x) + abs(y))  # bin_of, inlined in single precision: this is a loop over all points
+            if not abs(t) <= two:  # NaN
                 continue
-            t = y / a  # bin_of, inlined in single precision: this is a loop over all points
             if x < zero:
                 t = two - t
             elif y < zero:
@@ -64,10 +68,7 @@ def ring_image(p, r, starts, eye):
             q = near[k, b]
             if q == zero or r[i] < q:
                 near[k, b] = r[i]
-                slope[k, b] = p[i, 2] - ez
-    for k in range(rings):
-        for b in range(BINS):
-            slope[k, b] /= max(near[k, b], np.float32(0.1))
+                slope[k, b] = (p[i, 2] - ez) / r[i]
     return near, slope
 
 
@@ -154,40 +155,54 @@ SEEN_SIZE = 8
 
 
 @njit(cache=True)
-def look_at(near, tangent, R, eye, x, y, z, lx, ly, ground, radius, highest, out):
-    """What the rings say of a column through (x, y, z) with slope (lx, ly): (SEEN_SIZE,) `out`.
+def crossings(tangent, R, eye, x, y, z, lx, ly, out):
+    """Height (m), horizontal distance from the sensor (m), direction (x, y) of the places (rings, 4) `out` where the rings cross a
+    column through (x, y, z) with slope (lx, ly); False where rings run along it.
+
+    A ring is a cone about the sensor's axis: where it crosses the column is found by two steps of a fixed point.
+    """
+    ax, ay, az = R[0, 2], R[1, 2], R[2, 2]
+    if abs(az) < 0.3:
+        return False
+    for k in range(len(tangent)):
+        zk = z
+        for _ in range(3):
+            dx, dy, dz = x + lx * (zk - z) - eye[0], y + ly * (zk - z) - eye[1], zk - eye[2]
+            up = ax * dx + ay * dy + az * dz
+            flat = np.sqrt(max(dx * dx + dy * dy + dz * dz - up * up, 1e-6))
+            zk = min(max(zk + (tangent[k] * flat - up) / az, z - 8.0), z + 8.0)
+        dx, dy = x + lx * (zk - z) - eye[0], y + ly * (zk - z) - eye[1]
+        out[k, 0], out[k, 1], out[k, 2], out[k, 3] = zk, np.sqrt(dx * dx + dy * dy), dx, dy
+    return True
+
+
+CROWN_STEP = 0.08
+"""Directions nearer to each other than this at a crown's range are not looked at one by one, m."""
+
+
+@njit(cache=True)
+def look_at(near, crossed, ground, radius, highest, out):
+    """What the rings say of a column that they cross as in `crossed` (rings, 4): (SEEN_SIZE,) `out`.
 
     At 0.3-1.7 m: rings that met it, passed it, crossed it. At 1.9-4.5 m: rings that met its axis or passed it; the share of
     directions within 1 m that met something at its range, and how many were looked at. TOP is 1 where the next rings
     above `highest` passed, -1 where they met it, 0 unknown.
     """
     out[:] = 0.0
-    # A ring is a cone about the sensor's axis: where it crosses the column is found by two steps of a fixed point.
-    ax, ay, az = R[0, 2], R[1, 2], R[2, 2]
-    if abs(az) < 0.3:
-        return
     above = 0.0
     tops = 0
     for k in range(near.shape[0]):
-        zk = z
-        for _ in range(3):
-            dx, dy, dz = x + lx * (zk - z) - eye[0], y + ly * (zk - z) - eye[1], zk - eye[2]
-            up = ax * dx + ay * dy + az * dz
-            flat = np.sqrt(max(dx * dx + dy * dy + dz * dz - up * up, 1e-6))
-            zk += (tangent[k] * flat - up) / az
-            zk = min(max(zk, z - 8.0), z + 8.0)
-        h = zk - ground
+        h = crossed[k, 0] - ground
         if h < 0.3 or h > 4.5 or (1.7 < h < 1.9):
             continue
-        dx, dy = x + lx * (zk - z) - eye[0], y + ly * (zk - z) - eye[1]
-        d = np.sqrt(dx * dx + dy * dy)
-        b = bin_of(dx, dy)
+        d = crossed[k, 1]
+        b = bin_of(crossed[k, 2], crossed[k, 3])
         width = d * (4.0 / BINS) * 1.2  # of a bin, about
         reach = max(int(0.6 * radius / max(width, 1e-3)), 0)
         tolerance = 0.25 + radius + 0.01 * d
         met, through, blocked = False, True, False
-        for q in range(-reach, reach + 1):
-            v = near[k, (b + q) % BINS]
+        for q in range(b - reach, b + reach + 1):
+            v = near[k, _around(q)]
             if v > 0 and abs(v - d) < tolerance:
                 met = True
             elif v > 0 and v < d - tolerance:
@@ -206,14 +221,23 @@ def look_at(near, tangent, R, eye, x, y, z, lx, ly, ground, radius, highest, out
                 out[AXIS_HIT] += 1
             elif through:
                 out[AXIS_PASS] += 1  # no return upwards is the sky
-            wide = min(int(1.0 / max(width, 1e-3)), 60)
-            for q in range(-wide, wide + 1):
-                v = near[k, (b + q) % BINS]
+            every = max(int(CROWN_STEP / width), 1)
+            wide = min(int(1.0 / max(width, 1e-3)), 60) // every * every
+            for q in range(b - wide, b + wide + 1, every):
+                v = near[k, _around(q)]
                 if v == 0 or v > d - 1.0:
-                    out[CROWN_SEEN] += 1
+                    out[CROWN_SEEN] += every
                     if v > 0 and v < d + 1.0:
-                        out[CROWN_HIT] += 1
+                        out[CROWN_HIT] += every
         if h > highest + 0.05 and tops < 2 and h < 3.5 and not blocked:
             tops += 1
             above += -1.0 if met else (1.0 if through else 0.0)
     out[TOP] = 0.5 * above
+
+
+@njit(cache=True)
+def _around(b):
+    """A bin that may have gone once past either end."""
+    if b < 0:
+        return b + BINS
+    return b - BINS if b >= BINS else b

@@ -78,8 +78,8 @@ def look_around(cells, x, y, first, second, third, out):
         out[4] += (outer >> bit) & 1
 
 
-@njit(cache=True)
-def find_runs(p, r, h, starts, eye, step, low, high, widest):
+@njit(cache=True, fastmath=FAST)
+def find_runs(p, r, u, h, starts, step, low, high, widest):
     """Runs (K, RUN_SIZE) and the run (M,) of each point or -1.
 
     Columns: first and last point, ring, mean xyz (m), mean range, width, free sides, height, count. A leaf
@@ -90,31 +90,35 @@ def find_runs(p, r, h, starts, eye, step, low, high, widest):
     out = np.empty((max(m // 2, 1), RUN_SIZE), np.float64)
     label = np.full(m, -1, np.int32)
     k = 0
+    gap, beyond = np.float32(4.2 * step), np.float32(0.3)
     for ring in range(n_rings):
         lo, hi = starts[ring], starts[ring + 1]
         for i in range(lo, hi):
             if label[i] >= 0 or not (low < h[i] < high):
                 continue
-            bound = 0.13 + 0.003 * r[i]
+            bound = np.float32(0.13) + np.float32(0.003) * r[i]
+            reach = max(gap, np.float32(0.1) / r[i])
             n, last = 1, i
             label[i] = k
             sx, sy, sz = float(p[i, 0]), float(p[i, 1]), float(p[i, 2])
             sr, sh = float(r[i]), float(h[i])
-            recent = float(r[i])
+            recent = r[i]
             j = i + 1
-            while j < hi and angle_between(p, r, eye, j, last) < max(4.2 * step, 0.1 / r[i]):
+            while j < hi and angle_between(u, j, last) < reach:
                 if label[j] < 0 and low < h[j] < high and abs(r[j] - recent) < bound:
                     label[j] = k
                     last = j
                     n += 1
-                    recent += 0.4 * (r[j] - recent)  # noise must not end a run that bends
+                    recent += np.float32(0.4) * (r[j] - recent)  # noise must not end a run that bends
                     sx += p[j, 0]
                     sy += p[j, 1]
                     sz += p[j, 2]
                     sr += r[j]
                     sh += h[j]
                 j += 1
-            width = (np.arcsin(min(angle_between(p, r, eye, last, i), 1.0)) + step) * r[i]
+            width = 0.0
+            if n > 1:
+                width = (np.arcsin(min(angle_between(u, last, i), np.float32(1.0))) + step) * r[i]
             if n < 2 or width > 1.6 * widest or n < 0.4 * width / (step * r[i]) or k >= out.shape[0]:
                 for j in range(i, last + 1):
                     if label[j] == k:
@@ -122,9 +126,9 @@ def find_runs(p, r, h, starts, eye, step, low, high, widest):
                 continue
             # A side is free when what is seen beside the run lies behind it (or is nothing).
             mean, free = sr / n, 0.0
-            if i == lo or angle_between(p, r, eye, i, i - 1) > 3.2 * step or r[i - 1] > mean + 0.3:
+            if i == lo or angle_between(u, i, i - 1) > 3.2 * step or r[i - 1] > mean + beyond:
                 free += 1.0
-            if last == hi - 1 or angle_between(p, r, eye, last + 1, last) > 3.2 * step or r[last + 1] > mean + 0.3:
+            if last == hi - 1 or angle_between(u, last + 1, last) > 3.2 * step or r[last + 1] > mean + beyond:
                 free += 1.0
             row = out[k]
             row[FIRST], row[LAST], row[RING] = i, last, ring
@@ -133,6 +137,10 @@ def find_runs(p, r, h, starts, eye, step, low, high, widest):
             row[HEIGHT], row[COUNT] = sh / n, n
             k += 1
     return out[:k], label
+
+
+FARTHEST_LINK = 1.2
+"""Runs further from each other than this are never of one thing, m."""
 
 
 @njit(cache=True)
@@ -152,6 +160,8 @@ def link(runs):
             if rings < 1:
                 continue
             dx, dy = runs[j, PX] - runs[i, PX], runs[j, PY] - runs[i, PY]
+            if dx * dx + dy * dy > FARTHEST_LINK**2:
+                continue
             d = np.sqrt(dx * dx + dy * dy)
             dz = abs(runs[j, PZ] - runs[i, PZ])
             wide, thin = max(runs[i, WIDTH], runs[j, WIDTH]), min(runs[i, WIDTH], runs[j, WIDTH])

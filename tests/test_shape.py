@@ -1,0 +1,111 @@
+"""The shape of a tree from its sightings, and what its covariance owes to views that disagree."""
+
+import numpy as np
+import pytest
+
+from topograph.evaluate.metrics import match
+from topograph.geometry import from_xyz_rpy, inverse, transform
+from topograph.simulate.growth import _girth
+from topograph.trees import Detections, shapes
+from topograph.trunks.fit import LEAN_SIGMA_PRIOR
+
+HEIGHT = 0.8
+
+
+def around(n: int, distance: float = 4.0) -> np.ndarray:
+    """`n` poses (n, 4, 4) on a circle about the origin."""
+    turn = np.linspace(0, 2 * np.pi, n, endpoint=False) + 0.1
+    return np.array([from_xyz_rpy(distance * np.cos(a), distance * np.sin(a), 0, 0, 0, 2.0 * a) for a in turn])
+
+
+def sighted(
+    poses: np.ndarray, place: np.ndarray, slope: np.ndarray, tree: np.ndarray, scan: np.ndarray, stems: np.ndarray
+) -> Detections:
+    """Detections of trunks at `place` (N, 2) with measured `slope` (N, 2), both in the map, from the poses of `scan` (N,)."""
+    n = len(scan)
+    T = inverse(poses[scan])
+    in_map = np.concatenate([place, np.full((n, 1), HEIGHT)], axis=1)
+    up = np.einsum("nij,nj->ni", T[:, :3, :3], np.concatenate([slope, np.ones((n, 1))], axis=1))
+    up /= up[:, 2:]
+    weight = np.full(n, 1.0 / 0.05**2)
+    measured = np.stack(
+        [np.zeros(n), up[:, 0], up[:, 1], weight, np.full(n, 0.3), np.full(n, 0.02)],
+        axis=1,
+    )
+    return Detections(
+        stamps_ns=np.arange(1, len(poses) + 1) * 10**8,
+        scan=scan,
+        p=transform(T, in_map),
+        cov=np.tile(np.diag([4e-4, 4e-4, LEAN_SIGMA_PRIOR**2]), (n, 1, 1)),
+        axis=up / np.linalg.norm(up, axis=1, keepdims=True),
+        height=np.full(n, HEIGHT),
+        diameter=np.full(n, 0.3),
+        score=np.full(n, 5.0),
+        kinds=np.tile(np.log([0.98, 0.01, 0.01]), (n, 1)),
+        measured=measured,
+        stems=stems,
+        source=np.arange(n),
+        free=np.zeros((0, 360), np.uint32),
+        eye=np.zeros((len(poses), 3)),
+    )
+
+
+@pytest.mark.parametrize("views", [1, 3, 8])
+def test_views_that_disagree_are_in_the_covariance(views: int) -> None:
+    """Each side of a tree is off by its own error, which a thousand more scans of that side repeat. The variance of place and
+    slope must be that of the mean of sides, not of scans.
+    """
+    rng = np.random.default_rng(7)
+    trees, per_view, of_place, of_slope = 400, 12, 0.02, 0.04
+    poses = around(8)
+    place, slope, tree, scan, error = [], [], [], [], []
+    for t in range(trees):
+        sides = rng.permutation(8)[:views] if t < trees // 2 else rng.permutation(8)  # the others are seen from all sides
+        at, lean = rng.normal(0, of_place, (len(sides), 2)), rng.normal(0, of_slope, (len(sides), 2))
+        place.append(np.repeat(at, per_view, axis=0) + rng.normal(0, 0.005, (len(sides) * per_view, 2)))
+        slope.append(np.repeat(lean, per_view, axis=0) + rng.normal(0, 0.01, (len(sides) * per_view, 2)))
+        tree.append(np.full(len(sides) * per_view, t))
+        scan.append(np.repeat(sides, per_view))
+        error.append(at.mean(axis=0))
+    scans = np.concatenate(scan)
+    order = np.argsort(scans, kind="stable")
+    rows = [np.concatenate(k)[order] for k in (place, slope, tree)]
+    d = sighted(poses, rows[0], rows[1], rows[2], scans[order], np.ones(len(scans), np.int64))
+    s = shapes(d, rows[2], poses, trees)
+    few = slice(0, trees // 2)
+    assert np.mean(np.array(error)[few] ** 2 / s.place_var[few, None]) == pytest.approx(1.0, abs=0.35)
+    assert 0.4 < np.mean(s.slope[few] ** 2 / s.slope_var[few, None]) < 1.3
+
+
+def test_a_stem_seen_more_often_does_not_pull_the_axis(seed: int = 3) -> None:
+    """Two stems lean away from each other by 0.3; one is seen five times as often. The tree below them stands upright, and
+    each sighting is taken down along its own stem.
+    """
+    rng = np.random.default_rng(seed)
+    poses = around(60)
+    scan = np.arange(60)
+    first = rng.random(60) < 5.0 / 6.0
+    lean = np.where(first[:, None], [0.3, 0.0], [-0.3, 0.0])
+    place = lean * (HEIGHT - 0.4) + rng.normal(0, 0.01, (60, 2))
+    stems = np.where(rng.random(60) < 0.5, 2, 1)
+    d = sighted(poses, place, lean + rng.normal(0, 0.03, (60, 2)), np.zeros(60, int), scan, stems)
+    s = shapes(d, np.zeros(60, int), poses, 1)
+    assert s.stems[0] == 2
+    assert np.abs(s.slope[0]).max() < 0.03
+    assert np.mean(np.abs(s.own_slope - lean).max(axis=1) < 0.05) > 0.9
+
+
+def test_a_girth_of_one_circle_and_of_two() -> None:
+    assert _girth(np.array([[0.0, 0.0, 0.2]]))[1] == 0.4
+    middle, diameter = _girth(np.array([[-0.1, 0.0, 0.2], [0.1, 0.0, 0.2]]))
+    np.testing.assert_allclose(middle, 0.0, atol=5e-3)
+    assert diameter == pytest.approx((2 * np.pi * 0.2 + 2 * 0.2) / np.pi, rel=0.01)  # a tape: two half circles and two straights
+
+
+def test_a_false_node_at_the_end_of_a_row_pushes_nobody_aside() -> None:
+    """A dense row, its last tree missed, a false node before its first: one miss, one false, all others are themselves."""
+    true = np.stack([np.arange(12) * 0.95, np.zeros(12)], axis=1)
+    found = np.concatenate([[[-0.95, 0.0]], true[:-1] + 0.01])
+    i, j = match(found, true)
+    assert len(i) == 11
+    np.testing.assert_array_equal(i, j + 1)

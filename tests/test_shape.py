@@ -60,7 +60,9 @@ def test_views_that_disagree_are_in_the_covariance(views: int) -> None:
     poses = around(8)
     place, slope, tree, scan, error = [], [], [], [], []
     for t in range(trees):
-        sides = rng.permutation(8)[:views] if t < trees // 2 else rng.permutation(8)  # the others are seen from all sides
+        sides = (
+            rng.permutation(8)[:views] if t < trees // 2 else rng.permutation(8)
+        )  # the others are seen from all sides
         at, lean = rng.normal(0, of_place, (len(sides), 2)), rng.normal(0, of_slope, (len(sides), 2))
         place.append(np.repeat(at, per_view, axis=0) + rng.normal(0, 0.005, (len(sides) * per_view, 2)))
         slope.append(np.repeat(lean, per_view, axis=0) + rng.normal(0, 0.01, (len(sides) * per_view, 2)))
@@ -99,7 +101,9 @@ def test_a_girth_of_one_circle_and_of_two() -> None:
     assert _girth(np.array([[0.0, 0.0, 0.2]]))[1] == 0.4
     middle, diameter = _girth(np.array([[-0.1, 0.0, 0.2], [0.1, 0.0, 0.2]]))
     np.testing.assert_allclose(middle, 0.0, atol=5e-3)
-    assert diameter == pytest.approx((2 * np.pi * 0.2 + 2 * 0.2) / np.pi, rel=0.01)  # a tape: two half circles and two straights
+    assert diameter == pytest.approx(
+        (2 * np.pi * 0.2 + 2 * 0.2) / np.pi, rel=0.01
+    )  # a tape: two half circles and two straights
 
 
 def test_a_false_node_at_the_end_of_a_row_pushes_nobody_aside() -> None:

@@ -26,7 +26,7 @@ STILL = 0.6
 """Parts of a landmark's sightings lie no further apart in the solved map, m: half of a thick trunk."""
 NEAR = 5.0
 """Range at which a sighting tells half as much of what a thing is as one at arm's length, m."""
-DOUBTFUL = 0.4
+DOUBTFUL = 0.7
 """Log-odds by which a tree may fall short of its share of the run's usual score, see `TreesConfig.usual_score`."""
 RARE = 2.5
 """Log-odds that a tree seen once would need beyond that; the demand falls with the root of the sightings."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,9 @@ VIEWS = 8
 """Sectors of the compass a tree is seen from: what is wrong with a view is wrong with all sightings of it."""
 USUAL_VIEWS = 4.0
 """Views' worth of the run's other trees in what a tree's own views say of how far they disagree."""
-VIEW_SIGMA, VIEW_LEAN = 0.01, 0.03
+VIEW_SIGMA, VIEW_LEAN = 0.006, 0.015
 """Disagreement of views that is there before any was seen: of places, m, and of slopes, rad."""
-BEND = 0.012
+BEND = 0.008
 """A trunk's axis below what was seen is not the axis seen, rad."""
 FORK = 0.4
 """Height above ground at which the stems of one tree are taken to part, m."""
@@ -94,7 +95,9 @@ def shapes(
         own_slope=np.full((len(d), 2), np.nan),
     )
     at_height, middle, lever = _places(d, map_T_scan)
-    views = _views(d, map_T_scan, middle)
+    away = _directions(d, map_T_scan, middle)
+    views = np.minimum(((np.arctan2(away[:, 1], away[:, 0]) + np.pi) / (2 * np.pi) * VIEWS).astype(np.int64), VIEWS - 1)
+    slope = slope - _seen_lean(slope, weight, away, order, ends) * away
     trust = 1.0 / np.maximum(0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1]), 1e-6)
     places, slopes = _Views(n, VIEW_SIGMA), _Views(n, VIEW_LEAN)
     for j in range(n):
@@ -135,13 +138,30 @@ def _places(d: Detections, map_T_scan: Array) -> tuple[Array, Array, Array]:
     return transform(T, d.p)[:, :2], transform(T, below)[:, :2], lever
 
 
-def _views(d: Detections, map_T_scan: Array, place: Array) -> NDArray[np.int64]:
-    """Sector (N,) of the compass in which the robot stood, seen from what it sighted at `place` (N, 2)."""
+def _directions(d: Detections, map_T_scan: Array, place: Array) -> Array:
+    """Unit vectors (N, 2) in the map from what was sighted at `place` (N, 2) towards the sensor's robot."""
     if not len(d):
-        return np.zeros(0, np.int64)
+        return np.zeros((0, 2))
     away = map_T_scan[d.scan, :2, 3] - place
-    turn = (np.arctan2(away[:, 1], away[:, 0]) + np.pi) / (2 * np.pi)
-    return np.minimum((turn * VIEWS).astype(np.int64), VIEWS - 1)
+    return np.asarray(away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9))
+
+
+def _seen_lean(slope: Array, weight: Array, away: Array, order: NDArray[np.int64], ends: NDArray[np.int64]) -> float:
+    """How much all trunks of a run seem to lean towards whoever looks at them: they taper more or less than was thought.
+
+    It shows in trees that are seen from several sides; those that are seen from one need it.
+    """
+    seen, total = 0.0, 0.0
+    for a, b in pairwise(ends.tolist()):
+        mine = order[a:b]
+        w = weight[mine]
+        if w.sum() <= 0:
+            continue
+        mean, side = w @ slope[mine] / w.sum(), w @ away[mine] / w.sum()
+        apart = away[mine] - side
+        seen += float(w @ np.sum((slope[mine] - mean) * apart, axis=1))
+        total += float(w @ np.sum(apart * apart, axis=1))
+    return float(np.clip(seen / (total + 1e3), -0.1, 0.1))
 
 
 class _Views:

@@ -45,7 +45,7 @@ class TreesConfig:
     min_sightings: int = 6
     min_ratio: float = 0.15
     passed: float = 0.1
-    usual_score: float = 0.18
+    usual_score: float = 0.27
     min_share: float = 0.03
 
 

@@ -213,6 +213,7 @@ class _Association:
             place=np.concatenate([t.place, k.p[:, :2]]),
             foot=np.concatenate([t.foot, k.p[:, :2]]),
             width=np.concatenate([t.width, np.zeros(self.known)]),
+            post=np.concatenate([t.post, np.zeros(self.known)]),
             sigma=np.concatenate([t.sigma, np.sqrt(0.5 * (k.cov[:, 0, 0] + k.cov[:, 1, 1]))]),
             first=np.concatenate([t.first, long_ago]),
             last=np.concatenate([t.last, long_ago]),

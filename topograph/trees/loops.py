@@ -17,6 +17,7 @@ from topograph.geometry import Array, fit_rigid_2d, planar, transform
 from topograph.motion import MotionConfig
 from topograph.trees.detections import Detections
 from topograph.trees.tracks import TreesConfig
+from topograph.trunks.score import POST, TREE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,6 +27,7 @@ class TrackTable:
     Attributes:
         place: (T, 2) mean position in the current map estimate, m; `foot` (T, 2) where its axis meets the ground.
         width: diameter, m, 0 unknown.
+        post: mean log-odds of post against tree, 0 unknown.
         sigma: of `place`, m.
         first, last: distance driven at the first and last sighting, m.
         hits: sightings.
@@ -34,6 +36,7 @@ class TrackTable:
     place: Array
     foot: Array
     width: Array
+    post: Array
     sigma: Array
     first: Array
     last: Array
@@ -284,6 +287,7 @@ def tabulate(detections: Detections, track: NDArray[np.int64], map_T_scan: Array
         place=np.stack([mean(xy[:, k]) for k in range(2)], axis=1),
         foot=np.stack([mean(foot[:, k]) for k in range(2)], axis=1),
         width=mean(np.nan_to_num(d.diameter)),
+        post=mean(np.nan_to_num(d.kinds[:, POST] - d.kinds[:, TREE])),
         sigma=np.sqrt(mean(0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1])) / np.sqrt(total)),
         first=first,
         last=last,

@@ -9,6 +9,10 @@ from scipy.spatial import cKDTree
 from topograph.geometry import Array
 from topograph.trees.loops import TrackTable
 from topograph.trees.tracks import TreesConfig
+from topograph.trunks.fit import NOT_ONE
+
+TOLD = 1.0
+"""Log-odds from which a track is surely of one kind."""
 
 
 def refine(
@@ -18,7 +22,7 @@ def refine(
 
     A track that does not fit its tree leaves it, when it is also farther than `patience` m from it: a map that has
     just closed its loops is still bent. Then trees that lie within each other's gate, or whose feet or points are nearer
-    than `config.merge` (a thick trunk's pieces: than its radius), become one. Rare tracks join a tree when they fit and are trees of their own otherwise.
+    than `config.merge` (a thick trunk's pieces: than its radius), become one, but for a post beside a tree. Rare tracks join a tree when they fit and are trees of their own otherwise.
     """
     place, sigma, hits = tracks.place, tracks.sigma, tracks.hits
     tree = _leave(place, sigma, hits, tree.copy(), config, max(patience, config.merge))
@@ -30,6 +34,7 @@ def refine(
         spread = np.bincount(index, w * sigma) / total
         foot = np.stack([np.bincount(index, w * tracks.foot[:, k]) / total for k in range(2)], axis=1)
         width = np.bincount(index, w * tracks.width) / total
+        post = np.bincount(index, w * tracks.post) / total
         pairs = cKDTree(centre).query_pairs(max(3.0 * config.merge, 1.0), output_type="ndarray")
         a, b = pairs.T
         d = np.minimum(np.linalg.norm(centre[a] - centre[b], axis=1), np.linalg.norm(foot[a] - foot[b], axis=1))
@@ -37,6 +42,8 @@ def refine(
         fits = (d < config.merge + 0.4 * np.maximum(np.maximum(width[a], width[b]) - 0.2, 0.0)) | (
             d**2 < 0.5 * config.gate * variance
         )
+        apart = np.linalg.norm(centre[a] - centre[b], axis=1)
+        fits &= ~((post[a] * post[b] < 0) & (np.minimum(abs(post[a]), abs(post[b])) > TOLD) & (apart > NOT_ONE))
         if not fits.any():
             break
         name = np.arange(len(ids))

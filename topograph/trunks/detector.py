@@ -22,6 +22,8 @@ from topograph.trunks.passage import passage, ring_image
 from topograph.trunks.runs import FIRST, LAST, RUN_SIZE, find_runs, heights, link
 
 _NO_TIME = np.zeros(0, np.float32)
+SURE = float(np.log(0.7))
+"""Log-probability from which a candidate's kind is taken at its word."""
 STEM_DISTANCE = 0.45
 """Two trunks whose axes come that near are stems or pieces of one tree, m."""
 
@@ -125,7 +127,8 @@ class Detector:
         odds = scoring.column_odds(kinds)
         keep = odds > self.config.min_score
         fits, kinds, odds, name = c.fits[keep], kinds[keep], odds[keep], c.name[keep]
-        group = suppress(fits, odds, STEM_DISTANCE)
+        post = np.where(kinds.max(axis=1) > SURE, np.sign(kinds[:, scoring.POST] - kinds[:, scoring.TREE]), 0.0)
+        group = suppress(fits, odds, post, STEM_DISTANCE)
         best, merged = merge_stems(fits, scoring.tree_odds(kinds), group)
         wanted = np.full(len(c.runs), -1, np.int64)
         wanted[name] = np.searchsorted(best, group)

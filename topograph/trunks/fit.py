@@ -230,10 +230,14 @@ def foot_distance(a, b):
     return np.sqrt(min(fx * fx + fy * fy, dx * dx + dy * dy))
 
 
+NOT_ONE = 0.12
+"""A post and a tree are two things when their axes are further from each other than this, m."""
+
+
 @njit(cache=True)
-def suppress(out, score, distance):
+def suppress(out, score, post, distance):
     """Group (C,) of each trunk: those that stand within `distance` m of a better one are its stems or its pieces; a thick
-    trunk has its pieces within its radius.
+    trunk has its pieces within its radius. A `post` (C,) beside a tree is no piece of it: 1, -1 surely none, 0 who knows.
     """
     n = out.shape[0]
     group = np.full(n, -1, np.int64)
@@ -245,7 +249,10 @@ def suppress(out, score, distance):
         group[i] = i
         for b in range(a + 1, n):
             j = order[b]
-            if group[j] >= 0 or abs(out[i, X] - out[j, X]) + abs(out[i, Y] - out[j, Y]) > 3.0:
+            dx, dy = out[i, X] - out[j, X], out[i, Y] - out[j, Y]
+            if group[j] >= 0 or abs(dx) + abs(dy) > 3.0:
+                continue
+            if post[i] * post[j] < 0 and dx * dx + dy * dy > NOT_ONE**2:
                 continue
             if foot_distance(out[i], out[j]) < distance + 0.4 * max(out[i, DIAMETER] - 0.2, 0.0):
                 group[j] = i

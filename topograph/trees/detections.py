@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from topograph.bags import Trunks
 from topograph.geometry import Array, Stamps
 
+LEAST_BELIEVED = 0.05
 SECTORS = 360
 """Words of a scan's record of passage (trunks/passage.py)."""
 
@@ -48,6 +49,14 @@ class Detections:
 
     def __len__(self) -> int:
         return len(self.scan)
+
+    @property
+    def believed(self) -> Array:
+        """(N,) chance that each is a column at all, and not leaves beside one: its share of the information on where and how
+        its tree stands; 1 where the source tells no kinds.
+        """
+        column = np.exp(np.logaddexp(self.kinds[:, 0], self.kinds[:, 1]))
+        return np.where(np.isfinite(column), np.clip(column, LEAST_BELIEVED, 1.0), 1.0)
 
     @staticmethod
     def of(trunks: Sequence[Trunks]) -> Detections:

@@ -98,7 +98,7 @@ def shapes(
     away = _directions(d, map_T_scan, middle)
     views = np.minimum(((np.arctan2(away[:, 1], away[:, 0]) + np.pi) / (2 * np.pi) * VIEWS).astype(np.int64), VIEWS - 1)
     slope = slope - _seen_lean(slope, weight, away, order, ends) * away
-    trust = 1.0 / np.maximum(0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1]), 1e-6)
+    trust = d.believed / np.maximum(0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1]), 1e-6)
     places, slopes = _Views(n, VIEW_SIGMA), _Views(n, VIEW_LEAN)
     for j in range(n):
         mine = order[ends[j] : ends[j + 1]]
@@ -232,7 +232,7 @@ def _slopes(d: Detections, map_T_scan: Array) -> tuple[Array, Array]:
     """
     if not len(d):
         return np.zeros((0, 2)), np.zeros(0)
-    weight = d.measured[:, SLOPE_WEIGHT].copy()
+    weight = d.measured[:, SLOPE_WEIGHT] * d.believed
     axis = np.concatenate([d.measured[:, [SLOPE_X, SLOPE_Y]], np.ones((len(d), 1))], axis=1)
     stated = ~np.isfinite(d.kinds).all(axis=1) & (np.abs(d.axis[:, 2]) < 1.0 - 1e-9)
     axis[stated], weight[stated] = d.axis[stated], 1.0 / 0.05**2

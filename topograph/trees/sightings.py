@@ -62,6 +62,7 @@ def gather(
     p = transform(T, detections.p[keep])
     R = T[:, :3, :3]
     information = np.linalg.inv(R @ detections.cov[keep] @ np.swapaxes(R, 1, 2))
+    information *= detections.believed[keep, None, None]
     keyframe = keyframe_of_scan[detections.scan[keep]]
     label = keyframe * (int(tree.max(initial=0)) + 1) + tree[keep]
     _, first, index, count = np.unique(label, return_index=True, return_inverse=True, return_counts=True)

@@ -277,8 +277,9 @@ def stem_candidates(name: str, n: int, seed: int) -> tuple[Array, Array, Array]:
     X, y, sweep = [], [], []
     for k in range(n):
         elevation = [SENSORS["VLP-16"], SENSORS["64 rings"], np.linspace(-16, 15, 32)][rng.choice(3, p=[0.6, 0.2, 0.2])]
-        roll, pitch = rng.normal(0, 0.15, 2)
-        mount = from_xyz_rpy(0, 0, rng.uniform(0.5, 2.0), roll + np.pi * (rng.random() < 0.1), pitch, 0)
+        tilt, turn = rng.uniform(0, STEEPEST) * (rng.random() < 0.6), rng.uniform(0, 2 * np.pi)
+        roll, pitch = tilt * np.cos(turn) + np.pi * (rng.random() < 0.1), tilt * np.sin(turn)
+        mount = from_xyz_rpy(0, 0, rng.uniform(0.25, 2.5), roll, pitch, 0)
         for look in plot.looks(1, seed + k, elevation, mount):
             c = candidates(look.scan, mount, np.zeros(6), TrunksConfig())
             p = transform(look.plot_T_base, c.fits[:, :3])
@@ -295,6 +296,8 @@ def stem_candidates(name: str, n: int, seed: int) -> tuple[Array, Array, Array]:
     return np.concatenate(X), np.concatenate(y), np.concatenate(sweep)
 
 
+STEEPEST = 0.55
+"""Tilt of a mounting, rad."""
 UNLISTED = (1.95, 5.6)
 """A stem with low branches that stands in lpine1's cloud and not in its list, m."""
 
@@ -317,7 +320,8 @@ def street_candidates(first: int, last: int, every_ring: int) -> tuple[Array, Ar
         sure = known[d.argmin(axis=1), 3] > 0
         label = np.where((near < 0.45) & (kind < 2) & sure, kind, np.where(upright > 1.3, 2, -1))
         far = np.hypot(*(p[:, :2] - poses[k, :2, 3]).T)
-        X.append(c.features[far < 22.0])
-        y.append(label[far < 22.0])
+        sharp = far < np.where(label == 0, 30.0, 22.0)
+        X.append(c.features[sharp])
+        y.append(label[sharp])
         sweep.append(np.full(len(y[-1]), k))
     return np.concatenate(X), np.concatenate(y), np.concatenate(sweep)

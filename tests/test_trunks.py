@@ -13,9 +13,11 @@ from topograph.geometry import exp
 from topograph.pipeline import read_run
 from topograph.trunks import ThesisTrunksConfig, TrunksConfig
 from topograph.trunks.detector import Detector, candidates
-from topograph.trunks.fit import vertical
+from topograph.trunks.features import FEATURES
+from topograph.trunks.fit import AXIS_Z, OUT_SIZE, X, suppress, vertical
 from topograph.trunks.organise import rings_of
 from topograph.trunks.runs import COUNT, PX, PY, PZ, RUN_SIZE
+from topograph.trunks.score import kinds, network
 from topograph.trunks.thesis import ThesisDetector
 
 MOUNT = np.eye(4)
@@ -214,3 +216,46 @@ def test_missing_times_are_said_in_centimetres(lidar_run: tuple[Path, Truth], mo
     run = read_run([lidar_run[0]], Config(), span_s=(0.0, 8.0))
     assert any("no time per point" in n and " cm off" in n for n in run.notes)
     assert run.skipped["points: no time per point, not deskewed"] == run.scans
+
+
+def test_a_return_on_the_sensors_axis_does_no_harm() -> None:
+    """Straight above and straight below the sensor there is no direction to divide by."""
+    scan = cylinder_scene(16, 5.0, 2.0, 0.3)
+    assert scan.ring is not None
+    odd = np.array([[0, 0, 2.5], [0, 0, -1.2], [0, 0, 0], [np.nan, 0, 1], [np.inf, np.inf, np.inf]], np.float32)
+    xyz, ring = np.concatenate([odd, scan.xyz]), np.concatenate([np.arange(5, dtype=np.int32), scan.ring])
+    with_odd = candidates(replace(scan, xyz=xyz, ring=ring), MOUNT, np.zeros(6), TrunksConfig()).fits
+    assert np.hypot(with_odd[:, 0] - 5.0, with_odd[:, 1] - 2.0).min() < 0.03
+
+
+def test_the_patch_tells_met_from_passed() -> None:
+    """A bare cylinder: beams meet it over all its height and pass beside it, 0.3 to 1.1 m off on both sides."""
+    c = candidates(cylinder_scene(32, 4.0, 1.0, 0.3), MOUNT, np.zeros(6), TrunksConfig())
+    f = dict(zip(FEATURES, c.features[np.argmin(np.hypot(c.fits[:, 0] - 4.0, c.fits[:, 1] - 1.0))], strict=True))
+    for row in (2, 3, 4):
+        assert f[f"met_{row}_0"] > 0.6
+    for row in (1, 2):  # beyond, the ground is met within the sensor's reach
+        assert f[f"met_{row}_4"] < -0.6
+        assert f[f"seen_{row}_4"] > 0.6
+
+
+def test_kinds_do_not_depend_on_the_order_of_candidates_and_do_on_their_company() -> None:
+    rng = np.random.default_rng(0)
+    n = network()
+    x = np.asarray(n.mean + 0.7 * n.deviation * rng.normal(size=(30, len(n.mean))))
+    x = np.clip(x, n.low, n.high)
+    order = rng.permutation(30)
+    np.testing.assert_allclose(kinds(x, n)[order], kinds(x[order], n), atol=1e-4)
+    np.testing.assert_allclose(np.exp(kinds(x, n)).sum(axis=1), 1.0)
+    assert np.abs(kinds(x, n)[:1] - kinds(x[:1], n)).max() > 1e-3
+
+
+def test_a_post_beside_a_tree_is_kept_apart() -> None:
+    """Two columns 0.3 m apart are one thing with two stems, unless one is surely a post and the other surely none."""
+    fits = np.zeros((2, OUT_SIZE))
+    fits[:, AXIS_Z], fits[1, X] = 1.0, 0.3
+    odds = np.array([3.0, 2.0])
+    assert suppress(fits, odds, np.array([-1.0, 0.0]), 0.45).tolist() == [0, 0]
+    assert suppress(fits, odds, np.array([-1.0, 1.0]), 0.45).tolist() == [0, 1]
+    fits[1, X] = 0.05
+    assert suppress(fits, odds, np.array([-1.0, 1.0]), 0.45).tolist() == [0, 0]

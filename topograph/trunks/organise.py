@@ -55,9 +55,9 @@ def _rise(xyz, ring, n, every):
         full[ring[i]] += 1
     for i in range(0, len(ring), every):
         x, y = xyz[i, 0], xyz[i, 1]
-        t = xyz[i, 2] / np.sqrt(x * x + y * y)
-        if np.isfinite(t):
-            total[ring[i]] += t
+        flat = np.sqrt(x * x + y * y)
+        if flat > 0.0 and np.isfinite(flat) and np.isfinite(xyz[i, 2]):
+            total[ring[i]] += xyz[i, 2] / flat
             count[ring[i]] += 1
     return full, total, count
 
@@ -169,7 +169,8 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
         p[k, 0], p[k, 1], p[k, 2] = bx, by, bz
         ex, ey = bx - tx, by - ty
         far = np.sqrt(ex * ex + ey * ey)
-        one = np.float32(1.0) / max(far, np.float32(1e-6))
+        far = max(far, np.float32(1e-3))  # straight above or below
+        one = np.float32(1.0) / far
         r[k] = far
         u[k, 0], u[k, 1] = ex * one, ey * one
         cx, cy = int(bx + HALF), int(by + HALF)

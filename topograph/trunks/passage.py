@@ -57,9 +57,10 @@ def ring_image(p, r, u, starts, eye):
     for k in range(rings):
         for i in range(starts[k], starts[k + 1]):
             x, y = u[i, 0], u[i, 1]
-            t = y / (abs(x) + abs(y))  # bin_of, inlined in single precision: this is a loop over all points
-            if not abs(t) <= two:  # NaN
+            a = abs(x) + abs(y)
+            if not a > zero:  # NaN too
                 continue
+            t = y / a  # bin_of, inlined in single precision: this is a loop over all points
             if x < zero:
                 t = two - t
             elif y < zero:

@@ -1,5 +1,7 @@
 """The shape of a tree from its sightings, and what its covariance owes to views that disagree."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -80,21 +82,39 @@ def test_views_that_disagree_are_in_the_covariance(views: int) -> None:
 
 
 def test_a_stem_seen_more_often_does_not_pull_the_axis() -> None:
-    """Two stems lean away from each other by 0.3; one is seen five times as often. The tree below them stands upright, and
-    each sighting is taken down along its own stem.
+    """Two stems lean away from each other by 0.3; one is seen five times as often, every second scan sees both. The tree below
+    them stands upright, and each sighting is taken down along what it saw.
     """
     rng = np.random.default_rng(3)
     poses = around(60)
     scan = np.arange(60)
-    first = rng.random(60) < 5.0 / 6.0
-    lean = np.where(first[:, None], [0.3, 0.0], [-0.3, 0.0])
+    first = scan % 12 != 1
+    both = np.arange(60) % 2 == 0
+    lean = np.where(both[:, None], [0.0, 0.0], np.where(first[:, None], [0.3, 0.0], [-0.3, 0.0]))
     place = lean * (HEIGHT - 0.4) + rng.normal(0, 0.01, (60, 2))
-    stems = np.where(rng.random(60) < 0.5, 2, 1)
+    stems = np.where(both, 2, 1)
     d = sighted(poses, place, lean + rng.normal(0, 0.03, (60, 2)), np.zeros(60, int), scan, stems)
     s = shapes(d, np.zeros(60, int), poses, 1)
     assert s.stems[0] == 2
     assert np.abs(s.slope[0]).max() < 0.03
     assert np.mean(np.abs(s.own_slope - lean).max(axis=1) < 0.05) > 0.9
+    known = shapes(d, np.zeros(60, int), poses, 1, np.array([0]))
+    assert known.stems[0] == 2  # counted,
+    assert not known.forked[0]  # and stated at its own height all the same
+
+
+def test_recorded_axes_that_disagree_widen_the_lean() -> None:
+    """Detections that state an axis and no kinds: the variance of the lean is that of sides, too."""
+    rng = np.random.default_rng(5)
+    poses = around(8)
+    trees, again = 150, 12
+    tree, scan = np.tile(np.repeat(np.arange(trees), again), 8), np.repeat(np.arange(8), again * trees)
+    n = len(tree)
+    lean = np.repeat(rng.normal(0, 0.08, (8 * trees, 2)), again, axis=0) + rng.normal(0, 0.01, (n, 2))
+    d = sighted(poses, np.zeros((n, 2)), lean, tree, scan, np.ones(n, int))
+    d = replace(d, kinds=np.full((n, 3), np.nan), measured=np.zeros((n, 6)))
+    s = shapes(d, tree, poses, trees)
+    assert 0.5 < np.mean(s.slope**2 / s.slope_var[:, None]) < 1.4
 
 
 def test_a_girth_of_one_circle_and_of_two() -> None:

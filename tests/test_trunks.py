@@ -17,7 +17,7 @@ from topograph.trunks.features import FEATURES
 from topograph.trunks.fit import AXIS_Z, OUT_SIZE, X, suppress, vertical
 from topograph.trunks.organise import rings_of
 from topograph.trunks.runs import COUNT, PX, PY, PZ, RUN_SIZE
-from topograph.trunks.score import kinds, network
+from topograph.trunks.score import KIND_PRIOR, kinds, network
 from topograph.trunks.thesis import ThesisDetector
 
 MOUNT = np.eye(4)
@@ -248,6 +248,17 @@ def test_kinds_do_not_depend_on_the_order_of_candidates_and_do_on_their_company(
     np.testing.assert_allclose(kinds(x, n)[order], kinds(x[order], n), atol=1e-4)
     np.testing.assert_allclose(np.exp(kinds(x, n)).sum(axis=1), 1.0)
     assert np.abs(kinds(x, n)[:1] - kinds(x[:1], n)).max() > 1e-3
+
+
+def test_what_lies_outside_of_the_training_is_drawn_to_the_prior_and_blinds_nobody() -> None:
+    n = network()
+    x = np.tile(n.mean, (4, 1))
+    x[1, 0], x[2] = np.nan, n.high + 100.0
+    log_p = kinds(x, n)
+    assert np.isfinite(log_p).all()
+    evidence = np.abs(log_p - KIND_PRIOR).max(axis=1)
+    inside = replace(n, low=np.full_like(n.low, -np.inf), high=np.full_like(n.high, np.inf))
+    assert evidence[2] < 0.7 * np.abs(kinds(x, inside)[2] - KIND_PRIOR).max()
 
 
 def test_a_post_beside_a_tree_is_kept_apart() -> None:

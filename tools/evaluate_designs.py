@@ -48,7 +48,8 @@ def run(job: tuple[str, int], seconds: float, keep: Path | None = None) -> Resul
     """Simulate, map, compare. Bags in the folder `keep` are taken from there, or left there."""
     design, seed = job
     with tempfile.TemporaryDirectory() as folder:
-        bag = (keep or Path(folder)) / f"{design}_{seed}.bag"
+        bag = (keep or Path(folder)) / f"{design}_{seed}_{seconds:.0f}s.bag"
+        bag.parent.mkdir(parents=True, exist_ok=True)
         if not bag.exists():
             whole_bag = bag.with_name("of_" + bag.name)
             record(whole_bag, seed, DESIGNS[design], DriveConfig(longest_s=seconds), SensorConfig(sweep_hz=5.0))
@@ -99,7 +100,11 @@ def main() -> None:
     a.add_argument("--seeds", type=int, default=5)
     a.add_argument("--first", type=int, default=3001)
     a.add_argument("--seconds", type=float, default=60.0)
-    a.add_argument("--keep", type=Path, help="folder in which the bags stay for another time (about 120 MB each)")
+    a.add_argument(
+        "--keep",
+        type=Path,
+        help="folder in which the bags stay for another time (about 120 MB each); empty it when the simulator changes",
+    )
     a.add_argument("-v", "--verbose", action="store_true")
     a = a.parse_args()
     designs = a.designs or list(DESIGNS)

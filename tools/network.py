@@ -64,6 +64,8 @@ def train(X: NDArray[np.float32], y: NDArray[np.int64], w: Array, sweep: NDArray
     order = np.argsort(sweep, kind="stable")
     _, starts = np.unique(sweep[order], return_index=True)
     ends = np.append(starts, len(order))
+    if len(starts) < SWEEPS:
+        raise SystemExit(f"{len(starts)} sweeps with candidates; at least {SWEEPS} are needed to train")
     A, target = torch.from_numpy(np.ascontiguousarray(X)), torch.from_numpy(np.maximum(y, 0))
     weight = torch.from_numpy((np.where(y >= 0, w, 0.0) / w[y >= 0].mean()).astype(np.float32))
     optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=DECAY)

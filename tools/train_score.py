@@ -24,12 +24,11 @@ from scipy.spatial import cKDTree
 
 from topograph.geometry import Array
 from topograph.simulate.growth import POST, TRUNK
-from topograph.trees.existence import KIND_PRIOR
 from topograph.trunks import fit as F
 from topograph.trunks.config import TrunksConfig
 from topograph.trunks.detector import candidates
 from topograph.trunks.features import FEATURES, OVERHEAD
-from topograph.trunks.score import ERRORS, Layers, judge, log_softmax, normalised, tree_odds
+from topograph.trunks.score import ERRORS, KIND_PRIOR, Layers, judge, log_softmax, normalised, tree_odds
 
 SHIPPED = Path(__file__).parent.parent / "topograph" / "trunks" / "score.json"
 RECORDED = {"pine_plot": 0.2, "lpine1": 0.2, "street": 0.04}

@@ -401,7 +401,7 @@ def baseline(solved: Solved, config: Config) -> tuple[Estimate, TopoMap]:
         [],
         poses,
         all_trees,
-        solved.shapes.select(keep),
+        shapes(solved.detections, tree, poses, n),
         solved.problem.datum,
         config.topomap,
         {"method": "thesis"},

@@ -55,7 +55,7 @@ class Detections:
         """(N,) chance that each is a column at all, and not leaves beside one: its share of the information on where and how
         its tree stands; 1 where the source tells no kinds.
         """
-        column = np.exp(np.logaddexp(self.kinds[:, 0], self.kinds[:, 1]))
+        column = np.exp(self.kinds[:, 0]) + np.exp(self.kinds[:, 1])
         return np.where(np.isfinite(column), np.clip(column, LEAST_BELIEVED, 1.0), 1.0)
 
     @staticmethod

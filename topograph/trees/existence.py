@@ -12,10 +12,8 @@ from topograph.geometry import Array, inverse, transform
 from topograph.trees.detections import SECTORS, Detections
 from topograph.trees.screen import parts_apart
 from topograph.trees.tracks import TreesConfig
-from topograph.trunks.score import OTHER, TREE
+from topograph.trunks.score import KIND_PRIOR, OTHER, TREE
 
-KIND_PRIOR = np.log(np.array([0.2, 0.06, 0.74]))
-"""Shares of the kinds that the score was trained with."""
 FRESH = 0.25
 """Share of what a further sighting of the same tree says that the ones before have not said."""
 MOST = 6.0
@@ -149,7 +147,7 @@ def _through(d: Detections, scan: NDArray[np.int64], p: Array) -> NDArray[np.boo
 def _kinds(d: Detections, tree: NDArray[np.int64], n: int) -> tuple[NDArray[np.int64], Array]:
     """Most likely kind (n,) and its probability (n,); trees where the source tells no kinds.
 
-    Sightings of one thing are alike; a further one tells only so much more. What was seen with many returns weighs more.
+    Sightings of one thing are alike; a further one tells only so much more. What was seen from near weighs more.
     """
     told = (tree >= 0) & np.isfinite(d.kinds).all(axis=1)
     if not told.any():

@@ -27,7 +27,7 @@ class TrackTable:
     Attributes:
         place: (T, 2) mean position in the current map estimate, m; `foot` (T, 2) where its axis meets the ground.
         width: diameter, m, 0 unknown.
-        post: mean log-odds of post against tree, 0 unknown.
+        post: mean log-odds of post against tree, of what was a column, 0 unknown.
         sigma: of `place`, m.
         first, last: distance driven at the first and last sighting, m.
         hits: sightings.
@@ -287,7 +287,7 @@ def tabulate(detections: Detections, track: NDArray[np.int64], map_T_scan: Array
         place=np.stack([mean(xy[:, k]) for k in range(2)], axis=1),
         foot=np.stack([mean(foot[:, k]) for k in range(2)], axis=1),
         width=mean(np.nan_to_num(d.diameter)),
-        post=mean(np.nan_to_num(d.kinds[:, POST] - d.kinds[:, TREE])),
+        post=mean(d.believed * np.nan_to_num(d.kinds[:, POST] - d.kinds[:, TREE])),
         sigma=np.sqrt(mean(0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1])) / np.sqrt(total)),
         first=first,
         last=last,

@@ -46,7 +46,7 @@ class Shapes:
         slope: (T, 2) horizontal metres per metre of height; `slope_var` (T,).
         diameter: (T,) m or NaN; `diameter_sigma` (T,).
         height: (T,) above ground of the point that the sightings state, m.
-        stems: (T,).
+        stems: (T,) as counted; `forked` (T,) where the sightings state the fork.
         place_var: (T,) of the axis at that height, from how far views from different sides disagree, m².
         own_slope: (N, 2) slope of the stem that each of the N sightings saw, where its tree has several; else NaN.
     """
@@ -57,13 +57,9 @@ class Shapes:
     diameter_sigma: Array
     height: Array
     stems: NDArray[np.int64]
+    forked: NDArray[np.bool_]
     place_var: Array
     own_slope: Array
-
-    def select(self, keep: NDArray[np.bool_]) -> Shapes:
-        """The trees where `keep` (T,)."""
-        per_tree = ("slope", "slope_var", "diameter", "diameter_sigma", "height", "stems", "place_var")
-        return replace(self, **{k: getattr(self, k)[keep] for k in per_tree})
 
     @property
     def axis(self) -> Array:
@@ -75,7 +71,7 @@ class Shapes:
 def shapes(
     detections: Detections, tree: NDArray[np.int64], map_T_scan: Array, n: int, whole: NDArray[np.int64] | None = None
 ) -> Shapes:
-    """Shapes of `n` trees; `tree` (N,) of each detection or -1. Trees `whole` are of one stem, whatever was seen."""
+    """Shapes of `n` trees; `tree` (N,) of each detection or -1. Trees `whole` are stated as of one stem, whatever was seen."""
     d = detections
     order = np.argsort(tree, kind="stable")
     ends = np.searchsorted(tree[order], np.arange(n + 1))
@@ -91,6 +87,7 @@ def shapes(
         diameter_sigma=np.full(n, np.nan),
         height=np.zeros(n),
         stems=np.ones(n, np.int64),
+        forked=np.zeros(n, bool),
         place_var=np.zeros(n),
         own_slope=np.full((len(d), 2), np.nan),
     )
@@ -107,24 +104,25 @@ def shapes(
         out.diameter[j], out.diameter_sigma[j] = _thickness(d, mine)
         above = d.height[mine][np.isfinite(d.height[mine])]
         out.height[j] = np.median(above) if len(above) and measured else common
-        if whole is None or j not in whole:
-            out.stems[j] = _stems(d, mine)
-        if out.stems[j] > 1:
-            out.slope[j], own = _forked(at_height[mine], slope[mine], weight[mine], int(out.stems[j]))
+        out.stems[j] = _stems(d, mine)
+        out.forked[j] = out.stems[j] > 1 and (whole is None or j not in whole)
+        if out.forked[j]:
+            out.slope[j], own = _forked(
+                at_height[mine], slope[mine], weight[mine], d.stems[mine] > 1, int(out.stems[j])
+            )
             out.slope_var[j], out.own_slope[mine], out.height[j] = FORKED_LEAN**2, own, FORK
-            place = middle[mine] - (d.height[mine] - lever[mine] - FORK)[:, None] * own
+            above = np.where(np.isfinite(d.height[mine]), d.height[mine] - lever[mine] - FORK, 0.0)
+            place = middle[mine] - above[:, None] * own
         else:
             out.slope[j], v = _together(slope[mine], weight[mine])
             out.slope_var[j] = 1.0 / (v.sum() + 1.0 / LEAN_PRIOR**2)
             slopes.add(j, slope[mine] - out.slope[j], v, views[mine])
             place = middle[mine] + lever[mine, None] * out.slope[j]
         places.add(j, place - np.median(place, axis=0), trust[mine], views[mine])
-    if measured:
-        single = out.stems == 1
-        out.slope_var[single] = np.minimum(out.slope_var + BEND**2 + slopes.variance(), LEAN_PRIOR**2)[single]
+    single = ~out.forked
+    out.slope_var[single] = np.minimum(out.slope_var + BEND**2 + slopes.variance(), LEAN_PRIOR**2)[single]
+    if measured:  # recorded detections are all spread that way, and the graph learns how far
         out.place_var[:] = places.variance()
-    else:
-        out.slope_var[:] += BEND**2
     return out
 
 
@@ -195,20 +193,25 @@ class _Views:
         return np.asarray(own * self.share)
 
 
-def _forked(place: Array, slope: Array, weight: Array, stems: int) -> tuple[Array, Array]:
-    """Slope (2,) of a tree of several stems, the mean of theirs, and the slope (M, 2) of the stem that each sighting saw.
+def _forked(place: Array, slope: Array, weight: Array, several: NDArray[np.bool_], stems: int) -> tuple[Array, Array]:
+    """Slope (2,) of a tree of several stems, the mean of theirs, and the slope (M, 2) of what each sighting saw: of one stem, or
+    of their middle where it saw `several` (M,).
 
     Stems lean away from each other about the axis below them; one that is seen more often must not pull it to its side.
     """
-    group = _groups(place, min(stems, MOST_STEMS))
     own = np.zeros((len(place), 2))
+    one = np.flatnonzero(~several)
     found = []
-    for g in np.unique(group):
-        rows = group == g
-        own[rows] = _together(slope[rows], weight[rows])[0]
-        if rows.mean() > 0.1:
-            found.append(own[rows][0])
-    return np.mean(found, axis=0), own
+    if len(one) >= stems:
+        group = _groups(place[one], min(stems, MOST_STEMS))
+        for g in np.unique(group):
+            rows = one[group == g]
+            own[rows] = _together(slope[rows], weight[rows])[0]
+            if len(rows) > 0.1 * len(one):
+                found.append(own[rows[0]])
+    middle = np.mean(found, axis=0) if found else np.zeros(2)
+    own[several] = middle
+    return np.asarray(middle), own
 
 
 def _groups(place: Array, k: int) -> NDArray[np.int64]:
@@ -286,11 +289,11 @@ def relevelled(detections: Detections, tree: NDArray[np.int64], map_T_scan: Arra
 
     A point was measured at the mean height of its returns; where it is stated above or below, it owes its place to the
     lean. With the tree's own lean the covariance loses what the guess had added. Of a tree of several stems each scan
-    saw one or another: their points are stated where stems part, along the axis that the scan saw.
+    saw one or another: their points are stated where stems part, down along the stem that the scan saw.
     """
     d = detections
     own = np.flatnonzero(tree >= 0)
-    several = s.stems[tree[own]] > 1
+    several = s.forked[tree[own]]
     return _at_the_fork(_along(d, tree, own[~several], map_T_scan, s), own[several], map_T_scan, s)
 
 

@@ -127,7 +127,7 @@ class Detector:
         odds = scoring.column_odds(kinds)
         keep = odds > self.config.min_score
         fits, kinds, odds, name = c.fits[keep], kinds[keep], odds[keep], c.name[keep]
-        post = np.where(kinds.max(axis=1) > SURE, np.sign(kinds[:, scoring.POST] - kinds[:, scoring.TREE]), 0.0)
+        post = (kinds[:, scoring.POST] > SURE).astype(float) - (kinds[:, scoring.TREE] > SURE)
         group = suppress(fits, odds, post, STEM_DISTANCE)
         best, merged = merge_stems(fits, scoring.tree_odds(kinds), group)
         wanted = np.full(len(c.runs), -1, np.int64)

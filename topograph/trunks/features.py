@@ -84,6 +84,8 @@ def describe(p, r, runs, label, order, ends, fits, name, near, tangent, R, eye, 
         if crossings(tangent, R, eye, a[X], a[Y], a[Z], lx, ly, crossed):
             _beams(near, crossed, a[Z] - a[ABOVE], radius, highest, f)
             look_at_patch(near, crossed, a[Z] - a[ABOVE], radius, f[_PATCH:])
+        else:
+            f[_TRUNK_PASSED] = -1.0  # rings that run along columns tell nothing: outside of what was trained on
     return out
 
 

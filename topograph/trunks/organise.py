@@ -168,10 +168,9 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
             bz += t * uz + h * (wx * uy - wy * ux)
         p[k, 0], p[k, 1], p[k, 2] = bx, by, bz
         ex, ey = bx - tx, by - ty
-        far = np.sqrt(ex * ex + ey * ey)
-        far = max(far, np.float32(1e-3))  # straight above or below
-        one = np.float32(1.0) / far
-        r[k] = far
+        flat = max(np.sqrt(ex * ex + ey * ey), np.float32(1e-3))  # straight above or below
+        one = np.float32(1.0) / flat
+        r[k] = flat
         u[k, 0], u[k, 1] = ex * one, ey * one
         cx, cy = int(bx + HALF), int(by + HALF)
         if bx > -HALF and by > -HALF and cx < 2 * HALF and cy < 2 * HALF and bz < low[cx, cy]:

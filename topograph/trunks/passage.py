@@ -160,7 +160,7 @@ def crossings(tangent, R, eye, x, y, z, lx, ly, out):
     """Height (m), horizontal distance from the sensor (m), direction (x, y) of the places (rings, 4) `out` where the rings cross a
     column through (x, y, z) with slope (lx, ly); False where rings run along it.
 
-    A ring is a cone about the sensor's axis: where it crosses the column is found by two steps of a fixed point.
+    A ring is a cone about the sensor's axis: where it crosses the column is found by three steps of a fixed point.
     """
     ax, ay, az = R[0, 2], R[1, 2], R[2, 2]
     if abs(az) < 0.3:

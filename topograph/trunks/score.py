@@ -19,6 +19,8 @@ from topograph.trunks.features import FEATURES
 KINDS = ("tree", "post", "other")
 """What a candidate can be, in the order of the columns of log-probabilities."""
 TREE, POST, OTHER = range(3)
+KIND_PRIOR = np.log(np.array([0.2, 0.06, 0.74]))
+"""Shares of the kinds that the score is trained with."""
 CLIP = 4.0
 """Features further than this from the training's mean, in its deviations, tell no more than that they are far."""
 ALONE = 1.0
@@ -26,7 +28,7 @@ ALONE = 1.0
 LEAST = 8.0
 """Log-probabilities below minus this are all the same."""
 TEMPER = 0.5
-"""Share of the log-odds that is left to a candidate outside of what was trained on."""
+"""Share of the evidence that is left to a candidate outside of what was trained on."""
 
 
 class Layers(NamedTuple):
@@ -82,11 +84,13 @@ def network(file: str = "") -> Network:
 
 def kinds(features: Array, n: Network) -> Array:
     """Log-probabilities (C, 3) of KINDS of candidates of one sweep with `features` (C, len(FEATURES))."""
-    z = judge(normalised(features, n.mean, n.deviation), n.layers)
-    # Outside of what was trained on nobody knows: the answer is drawn towards "undecided", and many sightings decide.
-    far = ((features < n.low) | (features > n.high)).any(axis=1)
-    z[far] *= TEMPER
-    return log_softmax(z)
+    bad = np.asarray(~np.isfinite(features).all(axis=1))
+    known = np.where(bad[:, None], n.mean, features)  # one of them must not speak for the others
+    log_p = log_softmax(judge(normalised(known, n.mean, n.deviation), n.layers))
+    # Outside of what was trained on nobody knows: the answer is drawn towards the prior, and many sightings decide.
+    far = bad | ((known < n.low) | (known > n.high)).any(axis=1)
+    log_p[far] = log_softmax(KIND_PRIOR + TEMPER * (log_p[far] - KIND_PRIOR))
+    return log_p
 
 
 def normalised(features: Array, mean: Array, deviation: Array) -> NDArray[np.float32]:

@@ -29,7 +29,7 @@ FORK = 0.4
 """Height above ground at which the stems of one tree are taken to part, m."""
 APART = 0.2
 """Share of sightings that must see two stems; of single trunks up to a tenth do, by a branch, in dense rows up to a fifth."""
-FORKED_LEAN = 0.1
+FORKED_LEAN = 0.13
 """Sigma of the lean below the fork about the mean of the stems, rad."""
 MOST_STEMS = 3
 """That can be told apart by their places."""

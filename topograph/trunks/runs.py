@@ -78,6 +78,10 @@ def look_around(cells, x, y, first, second, third, out):
         out[4] += (outer >> bit) & 1
 
 
+FAILED, WALL = -2, -3
+"""Labels of points whose run was none: another may start at them, or not."""
+
+
 @njit(cache=True, fastmath=FAST)
 def find_runs(p, r, u, h, starts, step, low, high, widest):
     """Runs (K, RUN_SIZE) and the run (M,) of each point or -1.
@@ -94,7 +98,7 @@ def find_runs(p, r, u, h, starts, step, low, high, widest):
     for ring in range(n_rings):
         lo, hi = starts[ring], starts[ring + 1]
         for i in range(lo, hi):
-            if label[i] >= 0 or not (low < h[i] < high):
+            if label[i] >= 0 or label[i] == WALL or not (low < h[i] < high):
                 continue
             bound = np.float32(0.13) + np.float32(0.003) * r[i]
             reach = max(gap, np.float32(0.1) / r[i])
@@ -120,9 +124,11 @@ def find_runs(p, r, u, h, starts, step, low, high, widest):
             if n > 1:
                 width = (np.arcsin(min(angle_between(u, last, i), np.float32(1.0))) + step) * r[i]
             if n < 2 or width > 1.6 * widest or n < 0.4 * width / (step * r[i]) or k >= out.shape[0]:
+                # What is too wide is a wall from each of its points: looked at once, and its end is no column.
+                failed = WALL if width > 1.6 * widest else FAILED
                 for j in range(i, last + 1):
                     if label[j] == k:
-                        label[j] = -2
+                        label[j] = failed
                 continue
             # A side is free when what is seen beside the run lies behind it (or is nothing).
             mean, free = sr / n, 0.0

@@ -8,7 +8,7 @@ import pytest
 from topograph.evaluate.metrics import match
 from topograph.geometry import from_xyz_rpy, inverse, transform
 from topograph.simulate.growth import _girth
-from topograph.trees import Detections, shapes
+from topograph.trees import Detections, TreesConfig, exists, shapes
 from topograph.trunks.fit import LEAN_SIGMA_PRIOR
 
 HEIGHT = 0.8
@@ -115,6 +115,18 @@ def test_recorded_axes_that_disagree_widen_the_lean() -> None:
     d = replace(d, kinds=np.full((n, 3), np.nan), measured=np.zeros((n, 6)))
     s = shapes(d, tree, poses, trees)
     assert 0.5 < np.mean(s.slope**2 / s.slope_var[:, None]) < 1.4
+
+
+@pytest.mark.parametrize("score", [0.1, 0.3, 50.0])
+def test_scores_of_other_sources_count_against_each_other_only(score: float) -> None:
+    """A confidence of 0..1, or any other scale, is no log-odds: what all trees of a run score is enough."""
+    poses = around(8)
+    tree, scan = np.tile(np.arange(5), 8), np.repeat(np.arange(8), 5)
+    place = np.stack([tree % 5 - 2.0, np.zeros(40)], axis=1)
+    d = sighted(poses, place, np.zeros((40, 2)), tree, scan, np.ones(40, int))
+    d = replace(d, kinds=np.full((40, 3), np.nan), score=np.full(40, score))
+    places = np.stack([np.arange(5) - 2.0, np.zeros(5), np.full(5, HEIGHT)], axis=1)
+    assert exists(d, tree, poses, places, TreesConfig()).ok.all()
 
 
 def test_a_girth_of_one_circle_and_of_two() -> None:

@@ -12,6 +12,7 @@ from topograph.bags import Trunks
 from topograph.geometry import Array, Stamps
 
 LEAST_BELIEVED = 0.05
+"""Share of its information that a sighting keeps however little its scan believed in it: many such may still be a tree."""
 SECTORS = 360
 """Words of a scan's record of passage (trunks/passage.py)."""
 

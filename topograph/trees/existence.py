@@ -90,9 +90,9 @@ def exists(
     if (d.score[used] != 0.0).any():  # recorded detections may come without
         # Scores differ between sensors and orchards: what counts is also how this run's own trees score.
         surely = ok & (kind == TREE)
-        demand = (
-            config.usual_score * _usual(score[surely], hits[surely]) - DOUBTFUL + RARE / np.sqrt(np.maximum(hits, 1))
-        )
+        demand = np.full(n, config.usual_score * _usual(score[surely], hits[surely]))
+        if np.isfinite(d.kinds).any():  # ours are log-odds; of what other sources call a score nobody knows the scale
+            demand += RARE / np.sqrt(np.maximum(hits, 1)) - DOUBTFUL
         ok &= (kind != TREE) | (score >= demand)
     return Existence(ok=ok & (kind != OTHER), kind=kind, probability=probability, score=score, hits=hits, passed=passed)
 

@@ -37,12 +37,12 @@ def refine(
         post = np.bincount(index, w * tracks.post) / total
         pairs = cKDTree(centre).query_pairs(max(3.0 * config.merge, 1.0), output_type="ndarray")
         a, b = pairs.T
-        d = np.minimum(np.linalg.norm(centre[a] - centre[b], axis=1), np.linalg.norm(foot[a] - foot[b], axis=1))
+        apart = np.linalg.norm(centre[a] - centre[b], axis=1)
+        d = np.minimum(apart, np.linalg.norm(foot[a] - foot[b], axis=1))
         variance = spread[a] ** 2 + spread[b] ** 2 + 2 * config.floor**2
         fits = (d < config.merge + 0.4 * np.maximum(np.maximum(width[a], width[b]) - 0.2, 0.0)) | (
             d**2 < 0.5 * config.gate * variance
         )
-        apart = np.linalg.norm(centre[a] - centre[b], axis=1)
         fits &= ~((post[a] * post[b] < 0) & (np.minimum(abs(post[a]), abs(post[b])) > TOLD) & (apart > NOT_ONE))
         if not fits.any():
             break

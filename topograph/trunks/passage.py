@@ -39,6 +39,14 @@ def bin_of(x, y):
     return k if k < BINS else BINS - 1
 
 
+@njit(cache=True)
+def wrapped(b):
+    """A bin that may have gone once past either end."""
+    if b < 0:
+        return b + BINS
+    return b - BINS if b >= BINS else b
+
+
 @njit(cache=True, fastmath=FAST)
 def ring_image(p, r, u, starts, eye):
     """Nearest horizontal range (R, BINS) of what each ring met in each direction (0: no return), and the slope
@@ -203,7 +211,7 @@ def look_at(near, crossed, ground, radius, highest, out):
         tolerance = 0.25 + radius + 0.01 * d
         met, through, blocked = False, True, False
         for q in range(b - reach, b + reach + 1):
-            v = near[k, _around(q)]
+            v = near[k, wrapped(q)]
             if v > 0 and abs(v - d) < tolerance:
                 met = True
             elif v > 0 and v < d - tolerance:
@@ -225,7 +233,7 @@ def look_at(near, crossed, ground, radius, highest, out):
             every = max(int(CROWN_STEP / width), 1)
             wide = min(int(1.0 / max(width, 1e-3)), 60) // every * every
             for q in range(b - wide, b + wide + 1, every):
-                v = near[k, _around(q)]
+                v = near[k, wrapped(q)]
                 if v == 0 or v > d - 1.0:
                     out[CROWN_SEEN] += every
                     if v > 0 and v < d + 1.0:
@@ -234,11 +242,3 @@ def look_at(near, crossed, ground, radius, highest, out):
             tops += 1
             above += -1.0 if met else (1.0 if through else 0.0)
     out[TOP] = 0.5 * above
-
-
-@njit(cache=True)
-def _around(b):
-    """A bin that may have gone once past either end."""
-    if b < 0:
-        return b + BINS
-    return b - BINS if b >= BINS else b

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from topograph.trunks.organise import FAST
-from topograph.trunks.passage import BINS, MARGIN, bin_of
+from topograph.trunks.passage import BINS, MARGIN, bin_of, wrapped
 
 LEVELS = (0.05, 0.3, 0.6, 1.0, 1.4, 1.8, 2.3, 3.2, 4.5)
 """Heights above ground between the patch's rows, m."""
@@ -56,12 +56,7 @@ def look_at_patch(near, crossed, ground, radius, out):
             hits, passes = zero, zero
             while q <= end and q < BINS // 2:
                 for side in range(1 if q == 0 else 2):
-                    at = b + q if side == 0 else b - q
-                    if at >= BINS:
-                        at -= BINS
-                    elif at < 0:
-                        at += BINS
-                    v = ring[at]
+                    v = ring[wrapped(b + q if side == 0 else b - q)]
                     if v == zero:
                         passes += sky
                     elif v > first:

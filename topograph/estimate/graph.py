@@ -40,6 +40,11 @@ class _Pass:
     fix_scale: float = 1.0
 
 
+RELEARNT, STALE = 4, 0.6
+"""Under Huber, wrong fixes bend the path, and what they bend is learnt as noise of the trunks. Where the residuals of the last
+pass shrink below this share of the noise, it is learnt again, at most so often."""
+
+
 def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False, patient: bool = False) -> Estimate:
     """Path and trees of a run. `quick` stops after a Huber pass of few steps and gives no covariances (for association);
     with `patient` that pass runs until it has converged.
@@ -69,6 +74,12 @@ def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False, pati
     tukey = Kernel("tukey", config.tukey)
     last = _Pass(tukey, tukey, 0.0, *scales)
     values = levenberg_marquardt(_graph(problem, last, config, inert), values, config.iterations)
+    for _ in range(RELEARNT if config.learn_scale else 0):
+        scales = _learned_scales(problem, values, last)
+        if scales[0] > STALE * last.trunk_scale and scales[1] > STALE * last.fix_scale:
+            break
+        last = replace(last, trunk_scale=min(scales[0], last.trunk_scale), fix_scale=min(scales[1], last.fix_scale))
+        values = levenberg_marquardt(_graph(problem, last, config, inert), values, config.iterations)
     values, linear = with_big_stack(lambda: _polish(problem, last, config, inert, values))
     return _estimate(problem, config, values, last, linear, time.perf_counter() - began)
 
@@ -272,7 +283,7 @@ def _learned_scales(problem: Problem, values: Any, p: _Pass) -> tuple[float, flo
     Sightings of a tree from places close together err alike; the scale of the trunks grows with that correlation.
     """
     trunk, fix = 1.0, 1.0
-    e = _trunk_residuals(problem, values, p.trunk_scale)
+    e = _trunk_residuals(problem, values, 1.0)
     s = problem.sightings
     if len(e) > 30:
         norm = np.linalg.norm(e, axis=1)

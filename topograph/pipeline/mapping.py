@@ -310,14 +310,19 @@ def _associate_and_solve(
         estimate = replace(graph.solve(decided.problem, config.estimate), tree=decided.tree)
         progress("solve", (n + 1) / LAST_ROUNDS)
         after = a.decide(estimate)
-        if np.array_equal(after.tree, decided.tree):
-            break
+        if np.array_equal(after.tree, decided.tree) and np.array_equal(after.shapes.forked, decided.shapes.forked):
+            turned = np.abs(after.shapes.slope - decided.shapes.slope).max(initial=0.0)
+            decided = replace(decided, shapes=after.shapes)  # as the last path has them
+            if turned < SETTLED:
+                break
     progress("solve", 1.0)
     return decided, estimate, a.closer.loops
 
 
 LAST_ROUNDS = 4
 """Association and solve go on until neither changes, the last solve included; at most so often."""
+SETTLED = 0.01
+"""Slopes of trees that change by less between two solves do not change what was solved, m/m."""
 
 
 def _link(problem: Problem, estimate: Estimate, closer: LoopCloser) -> Link | None:

@@ -4,7 +4,7 @@ Every function takes plain numbers and arrays, checks them (GTSAM does not), and
 Poses are 4x4 matrices `map_T_robot`; tangent vectors and their covariances are (rotation, translation), body frame.
 """
 
-from factors.gnss import fix
+from factors.gnss import fix, fix_linear
 from factors.ground import level
 from factors.heading import heading
 from factors.imu import ImuNoise, bias_walk, preintegrate, preintegrated
@@ -20,6 +20,7 @@ __all__ = [
     "bearing_basis",
     "bias_walk",
     "fix",
+    "fix_linear",
     "from_pose3",
     "gaussian",
     "heading",

@@ -91,10 +91,12 @@ def trunk_linear(
     points: Array,
     cov: Array,
     kernel: Kernel,
+    extra: tuple[int, Array] | None = None,
 ) -> Array:
     """Add N sightings, linearised at `poses` (N, 4, 4) and `trees` (N, 3), to a GaussianFactorGraph.
 
-    `points` (N, 3) and `cov` (N, 3, 3) are the measurements. Returns the kernel's weights (N,).
+    `points` (N, 3) and `cov` (N, 3, 3) are the measurements; `extra` a further variable and the residuals' derivatives (N, 3, q)
+    by it. Returns the kernel's weights (N,).
     """
     e, by_pose, by_tree = trunk_residual(poses, trees, points)
     whiten = np.linalg.inv(np.linalg.cholesky(cov))
@@ -103,6 +105,12 @@ def trunk_linear(
     root = np.sqrt(weight)[:, None, None]
     A, B, b = root * (whiten @ by_pose), root * (whiten @ by_tree), -root[..., 0] * e
     unit = gtsam.noiseModel.Unit.Create(3)
-    for i in np.flatnonzero(weight > 1e-9).tolist():
+    used = np.flatnonzero(weight > 1e-9).tolist()
+    if extra is not None:
+        D = root * (whiten @ extra[1])
+        for i in used:
+            graph.add(gtsam.JacobianFactor(pose_keys[i], A[i], point_keys[i], B[i], extra[0], D[i], b[i], unit))
+        return weight
+    for i in used:
         graph.add(gtsam.JacobianFactor(pose_keys[i], A[i], point_keys[i], B[i], b[i], unit))
     return weight

@@ -143,14 +143,75 @@ def test_several_bags_are_one_run_in_order(tmp_path: Path) -> None:
         assert len(list(r.messages())) == 3
 
 
-def test_backward_and_nonsense_are_counted(tmp_path: Path) -> None:
+def imus(path: Path, stamps: list[float], logs: list[float] | None = None, topic: str = "/imu") -> Path:
+    """A bag of IMU samples stamped and recorded at so many seconds."""
+    with BagWriter(path) as w:
+        for s, at in zip(stamps, logs or stamps, strict=True):
+            w.imu(topic, T0 + int(at * 1e9), T0 + int(s * 1e9), "imu", np.zeros(3), np.ones(3))
+    return path
+
+
+@pytest.mark.parametrize("where", [0, 1, 150])
+@pytest.mark.parametrize("by", [3600.0, 3.2e7, -3600.0])
+def test_one_stamp_of_another_time_costs_one_message(tmp_path: Path, where: int, by: float) -> None:
+    at = [0.1 * k for k in range(200)]
+    stamps = [s + (by if k == where else 0.0) for k, s in enumerate(at)]
+    with Recording([imus(tmp_path / "a.bag", stamps, at)]) as r:
+        got = [m.stamp_ns for _, m in r.messages()]
+    assert got == [T0 + int(s * 1e9) for k, s in enumerate(at) if k != where]
+    assert r.skipped == Counter({"imu: stamp is not of its stream's clock": 1})
+
+
+@pytest.mark.parametrize("by", [-5.0, 30.0, 3600.0])
+def test_a_clock_that_is_set_goes_on(tmp_path: Path, by: float) -> None:
+    at = [0.1 * k for k in range(200)]
+    with Recording([imus(tmp_path / "a.bag", [s + by * (s > 10) for s in at], at)]) as r:
+        got = np.array([m.stamp_ns - T0 for _, m in r.messages()]) * 1e-9
+    np.testing.assert_allclose(got, at, atol=1e-6)
+    assert any("its clock was set" in n for n in r.clocks.notes)
+
+
+@pytest.mark.parametrize("stamp", [lambda s: s + 1000 - T0 * 1e-9, lambda s: -T0 * 1e-9])
+def test_a_stream_on_its_own_clock_is_laid_onto_the_others(tmp_path: Path, stamp) -> None:
     with BagWriter(tmp_path / "a.bag") as w:
-        for k, s in enumerate([10, 11, 5, 12]):
-            w.imu("/imu", T0 + k, T0 + s * 10**9, "imu", np.zeros(3), np.ones(3))
-        w.imu("/imu", T0 + 9, T0 + 13 * 10**9, "imu", np.full(3, np.nan), np.ones(3))
+        for k in range(200):
+            at = T0 + k * 10**8
+            w.odometry("/odom", at + 2 * 10**6, at, ("odom", "base_link"), np.eye(4), np.zeros(6))
+            w.imu("/imu", at + 10**6, T0 + int(stamp(0.1 * k) * 1e9), "imu", np.zeros(3), np.ones(3))
     with Recording([tmp_path / "a.bag"]) as r:
-        assert len(list(r.messages())) == 3
-        assert r.skipped == Counter({"imu: stamp goes backwards": 1, "imu: not finite": 1})
+        got = [m.stamp_ns for kind, m in r.messages() if kind == "imu"]
+    assert len(got) == 200
+    assert np.abs(np.array(got) - T0 - np.arange(200) * 10**8).max() < 5_000_000
+    assert any("imu" in n for n in r.clocks.notes)
+    assert not r.skipped
+
+
+def test_a_clock_that_runs_ahead_is_told(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a.bag") as w:
+        for k in range(200):
+            at = T0 + k * 10**8
+            w.odometry("/odom", at, at, ("odom", "base_link"), np.eye(4), np.zeros(6))
+            w.imu("/imu", at, at + 3 * 10**8, "imu", np.zeros(3), np.ones(3))
+    with Recording([tmp_path / "a.bag"]) as r:
+        assert len(list(r.messages())) == 400
+    assert r.clocks.ahead == {"imu": pytest.approx(0.3)}
+
+
+def test_recordings_whose_time_says_nothing_are_taken_as_they_are(tmp_path: Path) -> None:
+    """Converted bags put all messages at one time of recording."""
+    stamps = [0.1 * k for k in range(100)]
+    with Recording([imus(tmp_path / "a.bag", stamps, [1e-9 * k for k in range(100)])]) as r:
+        assert [m.stamp_ns for _, m in r.messages()] == [T0 + int(s * 1e9) for s in stamps]
+    assert not r.skipped
+
+
+def test_nonsense_is_counted(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "a.bag") as w:
+        for k in range(3):
+            w.imu("/imu", T0 + k * 10**8, T0 + k * 10**8, "imu", np.full(3, np.nan if k == 1 else 0.0), np.ones(3))
+    with Recording([tmp_path / "a.bag"]) as r:
+        assert len(list(r.messages())) == 2
+        assert r.skipped == Counter({"imu: not finite": 1})
 
 
 def test_topics() -> None:

@@ -5,8 +5,8 @@ The only room that knows ROS. `Recording` is the door; `BagWriter` is the way ba
 
 from topograph.bags.config import BagsConfig
 from topograph.bags.messages import Fix, Heading, Imu, Odometry, Trunks
-from topograph.bags.recording import Recording
+from topograph.bags.recording import DAMAGED, UNDECODED, Recording
 from topograph.bags.scan import Scan
 from topograph.bags.scan import decode as decode_scan
 
-__all__ = ["BagsConfig", "Fix", "Heading", "Imu", "Odometry", "Recording", "Scan", "Trunks", "decode_scan"]
+__all__ = ["DAMAGED", "UNDECODED", "BagsConfig", "Fix", "Heading", "Imu", "Odometry", "Recording", "Scan", "Trunks", "decode_scan"]

@@ -14,7 +14,6 @@ class BagsConfig:
         base_frame: the frame whose poses are estimated.
         extrinsics: frame -> (x, y, z, roll, pitch, yaw) of the sensor in `base_frame`, metres and radians;
             overrules TF.
-        max_backward_s: a stamp that is further behind the newest of its stream is dropped and counted, s.
     """
 
     topic_points: str = ""
@@ -25,4 +24,3 @@ class BagsConfig:
     topic_heading: str = ""
     base_frame: str = "base_link"
     extrinsics: dict[str, tuple[float, float, float, float, float, float]] = field(default_factory=dict)
-    max_backward_s: float = 1.0

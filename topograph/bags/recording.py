@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import heapq
 import logging
-import struct
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
-from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_typestore
 
 from topograph.bags import decode, topics
+from topograph.bags.clocks import Clocks, Message
 from topograph.bags.config import BagsConfig
 from topograph.bags.frames import Frames
 from topograph.bags.messages import Fix, Heading, Imu, Odometry, Trunks
@@ -28,6 +28,9 @@ from topograph.errors import InputError
 from topograph.geometry import from_quaternion
 
 log = logging.getLogger(__name__)
+
+UNDECODED = "cannot be decoded"
+DAMAGED = "announced by the recording's index, not in the file (damaged)"
 
 Product = Scan | Odometry | Imu | Fix | Heading | Trunks
 
@@ -42,6 +45,8 @@ class Recording:
         skipped: reason -> count, filled while reading.
         duration_s: from the first to the last message, by recording time.
         start_ns, log_ns: recording time of the first message, and of the one that was given last.
+        clocks: what the last reading found of the streams' clocks.
+        undecoded: stream kind -> why the first message that could not be decoded could not.
     """
 
     def __init__(self, paths: Sequence[Path], config: BagsConfig | None = None) -> None:
@@ -54,6 +59,8 @@ class Recording:
         self.counts: Counter[str] = Counter()
         self.duration_s = 0.0
         self.start_ns = self.log_ns = 0
+        self.clocks = Clocks(self.skipped)
+        self.undecoded: dict[str, str] = {}
         self._readers: list[AnyReader] = []
         self._stack = ExitStack()
 
@@ -98,15 +105,25 @@ class Recording:
                 ]
                 if not found:
                     continue
-                for n, (c, _, raw) in enumerate(reader.messages(connections=found)):
-                    if n >= most:
-                        break
-                    for t in reader.deserialize(raw, c.msgtype).transforms:  # type: ignore[attr-defined]
-                        x, q = t.transform.translation, t.transform.rotation
-                        if name == "tf" and t.header.frame_id.lstrip("/") in ("odom", "map", "world"):
-                            continue  # moving frames are not mounts
-                        pose = from_quaternion([x.x, x.y, x.z], [q.x, q.y, q.z, q.w])
-                        self.frames.add(t.header.frame_id, t.child_frame_id, pose)
+                try:
+                    for n, (c, _, raw) in enumerate(reader.messages(connections=found)):
+                        if n >= most:
+                            break
+                        self._add_tf(name, reader.deserialize(raw, c.msgtype))
+                except Exception as err:  # noqa: BLE001  # whatever the readers' libraries raise on damage; it is counted
+                    self.skipped[f"{name}: damaged"] += 1
+                    log.warning("%s: %s is damaged (%r)", self.paths[0].name, name, err)
+
+    def _add_tf(self, name: str, message: Any) -> None:
+        for t in message.transforms:
+            x, q = t.transform.translation, t.transform.rotation
+            if name == "tf" and t.header.frame_id.lstrip("/") in ("odom", "map", "world"):
+                continue  # moving frames are not mounts
+            row = np.array([x.x, x.y, x.z, q.x, q.y, q.z, q.w])
+            if not np.isfinite(row).all() or np.linalg.norm(row[3:]) < 1e-6:
+                self.skipped[f"{name}: {t.child_frame_id} is no pose (not finite, or a zero quaternion)"] += 1
+                continue
+            self.frames.add(t.header.frame_id, t.child_frame_id, from_quaternion(row[:3], row[3:]))
 
     def messages(
         self, kinds: Sequence[str] = tuple(topics.KINDS), window_ns: tuple[int, int] | None = None
@@ -116,25 +133,28 @@ class Recording:
         `window_ns` (from, to) bounds the time of recording.
         """
         wanted = {self.chosen[k]: k for k in kinds if k in self.chosen}
-        newest: dict[str, int] = {}
+        clocks = Clocks(self.skipped)
+        for m in clocks.pass_on(self._decoded(wanted, window_ns)):
+            self.log_ns = m.log_ns
+            self.clocks = clocks
+            yield m.kind, cast(Product, m.product)
+        self.clocks = clocks
+
+    def _decoded(self, wanted: dict[str, str], window_ns: tuple[int, int] | None) -> Iterator[Message]:
+        """Products in order of recording, stamps as they are; what the index announces and the file does not give is counted."""
+        given: Counter[str] = Counter()
         merged = heapq.merge(
             *(self._raw(i, set(wanted), window_ns) for i in range(len(self._readers))), key=lambda m: m[1]
         )
-        for i, self.log_ns, connection, raw in merged:
-            kind = wanted[connection.topic]
-            product = self._product(kind, self._readers[i], connection, raw)
-            if product is None:
-                continue
-            stamp = product.stamp_ns
-            if stamp <= 0:
-                self.skipped[f"{kind}: no header stamp"] += 1
-                continue
-            last = newest.get(kind, stamp)
-            if stamp < last - int(self.config.max_backward_s * 1e9):
-                self.skipped[f"{kind}: stamp goes backwards"] += 1
-                continue
-            newest[kind] = max(last, stamp)
-            yield kind, product
+        for i, log_ns, connection, raw in merged:
+            given[connection.topic] += 1
+            product = self._product(wanted[connection.topic], self._readers[i], connection, raw)
+            if product is not None:
+                yield Message(wanted[connection.topic], log_ns, product)
+        if window_ns is None:
+            for topic, kind in wanted.items():
+                if self.counts[topic] > given[topic]:
+                    self.skipped[f"{kind}: {DAMAGED}"] += self.counts[topic] - given[topic]
 
     def _raw(
         self, i: int, names: set[str], window_ns: tuple[int, int] | None
@@ -147,9 +167,10 @@ class Recording:
             start, stop = window_ns or (None, None)
             for connection, log_ns, raw in reader.messages(connections=found, start=start, stop=stop):
                 yield i, log_ns, connection, raw
-        except (AnyReaderError, struct.error, ValueError, EOFError, OSError, RuntimeError) as err:
-            self.skipped[f"rest of {self.paths[i].name}: damaged ({err})"] += 1
-            log.warning("%s: damaged, the rest is left out (%s)", self.paths[i], err)
+        except Exception as err:  # noqa: BLE001  # whatever the readers' libraries raise on damage; what is missing is counted
+            if window_ns is not None:
+                self.skipped[f"rest of {self.paths[i].name}: damaged"] += 1
+            log.warning("%s: damaged, the rest of it is left out (%r)", self.paths[i], err)
 
     def _product(self, kind: str, reader: AnyReader, connection: Connection, raw: Any) -> Product | None:
         typ = connection.msgtype
@@ -174,10 +195,9 @@ class Recording:
                     return None
                 return heading
             return decode.decode_trunks(message)
-        except InputError:
-            raise
-        except (AnyReaderError, struct.error, ValueError, IndexError, AssertionError) as err:
-            self.skipped[f"{kind}: cannot be decoded"] += 1
+        except Exception as err:  # noqa: BLE001  # one message; it is counted, and read_run bounds how many
+            self.skipped[f"{kind}: {UNDECODED}"] += 1
+            self.undecoded.setdefault(kind, str(err) or type(err).__name__)
             log.debug("%s: %s", connection.topic, err)
             return None
 
@@ -205,15 +225,6 @@ def _open(path: Path) -> AnyReader:
     try:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
-    except (
-        AnyReaderError,
-        OSError,
-        ValueError,
-        EOFError,
-        struct.error,
-        RuntimeError,
-        AssertionError,
-        KeyError,
-    ) as err:
+    except Exception as err:  # whatever the readers' libraries raise on damage
         raise InputError(f"{path}: {why_unreadable(path, err)}") from err
     return reader

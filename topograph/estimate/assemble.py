@@ -11,13 +11,13 @@ from topograph.estimate.problem import EstimateConfig, Fixes, Headings, Problem
 from topograph.geometry import Array, Datum, Stamps, inverse, transform
 from topograph.motion import Inertial, Motion, MotionConfig, Streams
 from topograph.trees import Detections, Sightings
-from topograph.trees.sightings import nearest_keyframe
+from topograph.trees.sightings import DELAY_NS, nearest_keyframe
 
 
 def empty_sightings() -> Sightings:
     """No sightings yet."""
     none = np.zeros(0, np.int64)
-    return Sightings(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)), none)
+    return Sightings(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)), none, np.zeros((0, 3)))
 
 
 def choose_datum(streams: Streams, keep: NDArray[np.bool_]) -> Datum | None:
@@ -85,7 +85,7 @@ def _fixes(
     keyframes_ns: Stamps, odom: Array, motion: Motion, streams: Streams, used: NDArray[np.bool_], robot_T_antenna: Array,
     datum: Datum | None, config: EstimateConfig, skipped: Counter[str],
 ) -> Fixes:  # fmt: skip
-    none = Fixes(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    none = Fixes(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)))
     if datum is None:
         return none
     stamps = streams.fix_ns
@@ -98,6 +98,8 @@ def _fixes(
     enu = datum.to_enu(streams.lat_lon_h[inside])
     k, keyframe_T_robot = _at_keyframes(keyframes_ns, odom, motion, stamps[inside])
     lever = transform(keyframe_T_robot, robot_T_antenna[:3, 3])
+    later = inverse(odom[k]) @ motion.at(stamps[inside] + DELAY_NS)
+    late = (transform(later, robot_T_antenna[:3, 3]) - lever) / (DELAY_NS * 1e-9)
     cov = streams.fix_cov[inside].copy()
     h, v = config.fix_floor
     cov[:, [0, 1, 2], [0, 1, 2]] = np.maximum(cov[:, [0, 1, 2], [0, 1, 2]], np.array([h, h, v]) ** 2)
@@ -109,7 +111,7 @@ def _fixes(
         np.add.at(out, index, x)
         return np.asarray(out / count.reshape(-1, *([1] * (x.ndim - 1))))
 
-    return Fixes(ids, mean(lever), mean(enu), mean(cov))
+    return Fixes(ids, mean(lever), mean(enu), mean(cov), mean(late))
 
 
 def _headings(

@@ -8,6 +8,7 @@ whose linear system also gives the covariances. Odometry and IMU are never robus
 from __future__ import annotations
 
 import time
+from collections.abc import Container, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,17 +21,17 @@ from topograph.errors import InsufficientDataError
 from topograph.estimate import covariance
 from topograph.estimate.inertia import Inertia, inertia
 from topograph.estimate.initial import initial_path, yaw_of_direction
-from topograph.estimate.problem import Estimate, EstimateConfig, Problem
+from topograph.estimate.problem import Estimate, EstimateConfig, Offset, Problem
 from topograph.estimate.solver import levenberg_marquardt, with_big_stack
 from topograph.geometry import Array, inverse, log, transform, wrap
 from topograph.trees import Sightings
 
-X, V, B, L = (gtsam.symbol(c, 0) for c in "xvbl")
+X, V, B, L, C = (gtsam.symbol(c, 0) for c in "xvblc")
 _NONE = Kernel("none")
 
 
 @dataclass(frozen=True, slots=True)
-class _Pass:
+class Pass:
     """Losses and noise of one solve: least deviation of a fix (m), factors on the noise of trunks and fixes."""
 
     trunk: Kernel
@@ -63,25 +64,27 @@ def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False, pati
     most = config.quick_sightings if quick else config.most_sightings
     problem = replace(problem, sightings=_nearest(problem.sightings, most))
     values = _values(problem, poses, trees, inert)
-    first = _Pass(huber, huber, 0.05 if quick else 0.0)
+    first = Pass(huber, huber, 0.05 if quick else 0.0)
     steps, tolerance = (3 * config.iterations, 1e-6)
     if quick:
         steps, tolerance = (3 * config.iterations, 1e-5) if patient else (10, 1e-3)
-    values = levenberg_marquardt(_graph(problem, first, config, inert), values, steps, tolerance)
+    values = levenberg_marquardt(graph_of(problem, first, config, inert), values, steps, tolerance)
     if quick:
         return _estimate(problem, config, values, first, None, time.perf_counter() - began)
     scales = _learned_scales(problem, values, first) if config.learn_scale else (1.0, 1.0)
     tukey = Kernel("tukey", config.tukey)
-    last = _Pass(tukey, tukey, 0.0, *scales)
-    values = levenberg_marquardt(_graph(problem, last, config, inert), values, config.iterations)
+    last = Pass(tukey, tukey, 0.0, *scales)
+    values = levenberg_marquardt(graph_of(problem, last, config, inert), values, config.iterations)
     for _ in range(RELEARNT if config.learn_scale else 0):
         scales = _learned_scales(problem, values, last)
         if scales[0] > STALE * last.trunk_scale and scales[1] > STALE * last.fix_scale:
             break
         last = replace(last, trunk_scale=min(scales[0], last.trunk_scale), fix_scale=min(scales[1], last.fix_scale))
-        values = levenberg_marquardt(_graph(problem, last, config, inert), values, config.iterations)
+        values = levenberg_marquardt(graph_of(problem, last, config, inert), values, config.iterations)
     values, linear = with_big_stack(lambda: _polish(problem, last, config, inert, values))
-    return _estimate(problem, config, values, last, linear, time.perf_counter() - began)
+    out = _estimate(problem, config, values, last, linear, time.perf_counter() - began)
+    tested = with_big_stack(lambda: _tested(problem, last, config, inert, values))
+    return replace(out, offsets=tested, seconds=time.perf_counter() - began)
 
 
 def _nearest(s: Sightings, most: int) -> Sightings:
@@ -97,21 +100,21 @@ def _nearest(s: Sightings, most: int) -> Sightings:
     rank_in_tree = np.empty(len(s), np.int64)
     rank_in_tree[by_tree] = np.arange(len(s)) - np.searchsorted(tree, tree, side="left")
     keep = (rank < most) | (rank_in_tree < 2)
-    return Sightings(s.keyframe[keep], s.tree[keep], s.p[keep], s.cov[keep], s.count[keep])
+    return Sightings(s.keyframe[keep], s.tree[keep], s.p[keep], s.cov[keep], s.count[keep], s.late[keep])
 
 
 def _poses_alone(problem: Problem, poses: Array, config: EstimateConfig) -> Array:
     """Odometry, fixes and headings only, under losses that narrow from metres to decimetres."""
     values = _values(problem, poses, np.zeros((0, 3)), None)
     if len(problem.fixes.keyframe) >= 3:
-        for p in (_Pass(_NONE, Kernel("huber", 1.345), 1.0), _Pass(_NONE, Kernel("cauchy", 1.0), 0.1)):
-            values = levenberg_marquardt(_graph(problem, p, config, None, trunks=False), values, 30, 1e-4)
+        for p in (Pass(_NONE, Kernel("huber", 1.345), 1.0), Pass(_NONE, Kernel("cauchy", 1.0), 0.1)):
+            values = levenberg_marquardt(graph_of(problem, p, config, None, without=("trunk", "tree")), values, 30, 1e-4)
     return _path(problem, values)
 
 
 def _values(problem: Problem, poses: Array, trees: Array, inert: Inertia | None) -> Any:
     values = gtsam.Values()
-    for k, T in enumerate(factors.to_pose3s(_orthonormal(poses))):
+    for k, T in enumerate(factors.to_pose3s(orthonormal(poses))):
         values.insert(X + k, T)
     for j, p in enumerate(trees):
         values.insert(L + j, p)
@@ -125,7 +128,7 @@ def _values(problem: Problem, poses: Array, trees: Array, inert: Inertia | None)
     return values
 
 
-def _orthonormal(poses: Array) -> Array:
+def orthonormal(poses: Array) -> Array:
     """Poses (..., 4, 4) with rounding taken out of their rotations."""
     U, _, Vt = np.linalg.svd(poses[..., :3, :3])
     out = poses.copy()
@@ -133,86 +136,85 @@ def _orthonormal(poses: Array) -> Array:
     return out
 
 
-def _graph(problem: Problem, p: _Pass, config: EstimateConfig, inert: Inertia | None, *, trunks: bool = True) -> Any:
-    g = gtsam.NonlinearFactorGraph()
-    _add_motion(g, problem, inert)
-    _add_fixes(g, problem, p)
+def factors_of(problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | None) -> Iterator[tuple[str, Any]]:
+    """Every factor of the problem once, with its kind: "motion", "odometry", "imu", "fix", "link", "heading", "trunk", "tree"."""
+    yield from _motion(problem, inert)
+    for f in _fixes(problem, p):
+        yield "fix", f
     if problem.link is not None:
         sigma = [0.1, 0.1, 0.02, 0.2, 0.2, 0.5]
-        g.add(factors.odometry(X + problem.link.a, X + problem.link.b, _orthonormal(problem.link.a_T_b), sigma))
-    for k, direction, yaw, sigma in zip(
-        problem.headings.keyframe.tolist(),
-        problem.headings.direction,
-        problem.headings.yaw,
-        problem.headings.sigma,
-        strict=True,
-    ):
-        g.add(
-            factors.heading(
-                X + k, float(yaw), direction, max(float(sigma), config.heading_floor), Kernel("huber", 1.345)
-            )
-        )
-    if trunks:
-        s = problem.sightings
-        cov = p.trunk_scale**2 * s.cov
-        for f in factors.trunks((X + s.keyframe).tolist(), (L + s.tree).tolist(), s.p, cov, p.trunk):
+        yield "link", factors.odometry(X + problem.link.a, X + problem.link.b, orthonormal(problem.link.a_T_b), sigma)
+    h = problem.headings
+    for k, direction, yaw, sigma in zip(h.keyframe.tolist(), h.direction, h.yaw, h.sigma, strict=True):
+        least = max(float(sigma), config.heading_floor)
+        yield "heading", factors.heading(X + k, float(yaw), direction, least, Kernel("huber", 1.345))
+    s = problem.sightings
+    for f in factors.trunks((X + s.keyframe).tolist(), (L + s.tree).tolist(), s.p, p.trunk_scale**2 * s.cov, p.trunk):
+        yield "trunk", f
+    for f in _tree_priors(problem):
+        yield "tree", f
+
+
+def graph_of(
+    problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | None, *, without: Container[str] = ()
+) -> Any:
+    """A NonlinearFactorGraph of the factors whose kind is not in `without`."""
+    g = gtsam.NonlinearFactorGraph()
+    for kind, f in factors_of(problem, p, config, inert):
+        if kind not in without:
             g.add(f)
-        _add_tree_priors(g, problem)
     return g
 
 
-def _add_tree_priors(g: Any, problem: Problem) -> None:
+def _tree_priors(problem: Problem) -> Iterator[Any]:
     """Keep every tree in the system even when a loss has given up on all its sightings."""
     wide = factors.sigmas([100.0] * 3)
     s = problem.sightings
     if problem.known is not None:
         k = problem.known
         for i in np.flatnonzero(k.tree >= 0).tolist():
-            g.add(gtsam.PriorFactorPoint3(L + int(k.tree[i]), k.p[i], factors.gaussian(k.cov[i])))
+            yield gtsam.PriorFactorPoint3(L + int(k.tree[i]), k.p[i], factors.gaussian(k.cov[i]))
     first = np.unique(s.tree, return_index=True)[1]
     T = problem.start if problem.start is not None else problem.odom_T_robot
     for i in first.tolist():
-        g.add(gtsam.PriorFactorPoint3(L + int(s.tree[i]), transform(T[s.keyframe[i]], s.p[i]), wide))
+        yield gtsam.PriorFactorPoint3(L + int(s.tree[i]), transform(T[s.keyframe[i]], s.p[i]), wide)
 
 
-def _add_motion(g: Any, problem: Problem, inert: Inertia | None) -> None:
+def _motion(problem: Problem, inert: Inertia | None) -> Iterator[tuple[str, Any]]:
     n = len(problem.stamps_ns)
     if problem.pose_sigma is not None:
         assert problem.start is not None
         for k in range(n):
-            g.add(
-                gtsam.PriorFactorPose3(
-                    X + k, factors.to_pose3(problem.start[k]), factors.sigmas([problem.pose_sigma] * 6)
-                )
-            )
+            exact = factors.sigmas([problem.pose_sigma] * 6)
+            yield "motion", gtsam.PriorFactorPose3(X + k, factors.to_pose3(problem.start[k]), exact)
         return
     step = inverse(problem.odom_T_robot[:-1]) @ problem.odom_T_robot[1:]
     sigma = problem.step_sigma.copy()
     if inert is not None:  # the gyro speaks through its own factor
         covered = ~np.array([f is None for f in inert.preintegrated])
         sigma[covered, :3] = np.maximum(5.0 * sigma[covered, :3], 0.05)
-    for f in factors.odometries([X + k for k in range(n)], _orthonormal(step), sigma):
-        g.add(f)
+    for f in factors.odometries([X + k for k in range(n)], orthonormal(step), sigma):
+        yield "odometry", f
     georeferenced = len(problem.fixes.keyframe) >= 3
-    first = factors.to_pose3(_orthonormal(problem.start[0] if problem.start is not None else problem.odom_T_robot[0]))
+    first = factors.to_pose3(orthonormal(problem.start[0] if problem.start is not None else problem.odom_T_robot[0]))
     tilt = 0.3 if problem.up_sigma is not None and np.isfinite(problem.up_sigma).any() else 0.03
     loose = [10.0, 10.0, 10.0, 1e4, 1e4, 1e4] if georeferenced else [tilt, tilt, 1e-3, 1e-3, 1e-3, 1e-3]
-    g.add(gtsam.PriorFactorPose3(X, first, factors.sigmas(loose)))
+    yield "motion", gtsam.PriorFactorPose3(X, first, factors.sigmas(loose))
     if problem.inertial is None:
         for k in range(0, n, 10):
-            g.add(factors.level(X + k, 0.3))
+            yield "motion", factors.level(X + k, 0.3)
         if problem.up is not None and problem.up_sigma is not None:
             for k in np.flatnonzero(np.isfinite(problem.up_sigma)).tolist():
-                g.add(factors.level(X + k, float(problem.up_sigma[k]), problem.up[k]))
+                yield "motion", factors.level(X + k, float(problem.up_sigma[k]), problem.up[k])
     elif inert is None:  # quick passes: the complementary filter's attitude stands in for the IMU factors
         for k in range(0, n, 5):
-            up = problem.odom_T_robot[k, 2, :3]
-            g.add(factors.level(X + k, 0.02, up))
+            yield "motion", factors.level(X + k, 0.02, problem.odom_T_robot[k, 2, :3])
     if inert is not None:
-        inert.add_to(g, X, V, B)
+        for f in inert.factors(X, V, B):
+            yield "imu", f
 
 
-def _add_fixes(g: Any, problem: Problem, p: _Pass) -> None:
+def _fixes(problem: Problem, p: Pass) -> Iterator[Any]:
     """Each fix twice: its horizontal part and its height, each under a loss of its own.
 
     Heights fail by tens of metres while positions are sound (a receiver that has just started): one must not take
@@ -228,10 +230,10 @@ def _add_fixes(g: Any, problem: Problem, p: _Pass) -> None:
     tall[:, 2, 2] = cov[:, 2, 2]
     for part in (flat, tall):
         for k, lever, z, c in zip(f.keyframe.tolist(), f.keyframe_p_antenna, f.map_p_antenna, part, strict=True):
-            g.add(factors.fix(X + k, z, lever, c, p.fix))
+            yield factors.fix(X + k, z, lever, c, p.fix)
 
 
-def _fix_cov(problem: Problem, p: _Pass) -> Array:
+def _fix_cov(problem: Problem, p: Pass) -> Array:
     f = problem.fixes
     return np.asarray(p.fix_scale**2 * f.cov + p.fix_floor**2 * np.eye(3))
 
@@ -277,7 +279,7 @@ def _fix_residuals(problem: Problem, values: Any) -> Array:
     return np.asarray(transform(_path(problem, values)[f.keyframe], f.keyframe_p_antenna) - f.map_p_antenna)
 
 
-def _learned_scales(problem: Problem, values: Any, p: _Pass) -> tuple[float, float]:
+def _learned_scales(problem: Problem, values: Any, p: Pass) -> tuple[float, float]:
     """Factors on the noise of trunks and fixes that make the middle of their residuals what a Gaussian's would be.
 
     Sightings of a tree from places close together err alike; the scale of the trunks grows with that correlation.
@@ -301,11 +303,9 @@ def _learned_scales(problem: Problem, values: Any, p: _Pass) -> tuple[float, flo
     return trunk, fix
 
 
-def _polish(problem: Problem, p: _Pass, config: EstimateConfig, inert: Inertia | None, values: Any) -> tuple[Any, Any]:
+def _polish(problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | None, values: Any) -> tuple[Any, Any]:
     """Gauss-Newton with Cartesian trunk residuals until steps are below a micrometre; the values and the last system."""
-    rest = _graph(problem, p, config, inert, trunks=False)
-    if problem.n_trees:
-        _add_tree_priors(rest, problem)
+    rest = graph_of(problem, p, config, inert, without=("trunk",))
     s = problem.sightings
     keys_x, keys_l = (X + s.keyframe).tolist(), (L + s.tree).tolist()
     cov = p.trunk_scale**2 * s.cov
@@ -322,7 +322,64 @@ def _polish(problem: Problem, p: _Pass, config: EstimateConfig, inert: Inertia |
     return values, linear
 
 
-def _estimate(problem: Problem, config: EstimateConfig, values: Any, p: _Pass, linear: Any, seconds: float) -> Estimate:
+def _tested(
+    problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | None, values: Any
+) -> tuple[Offset, ...]:
+    """Score tests (Rao 1948) of what is taken as given: clocks, mountings, the wheels' scale.
+
+    Each is a column of one more variable in the linear system of the solution, eliminated last. What it would have to be off
+    by, and how much better the residuals would be, follow without solving anew.
+    """
+    g = graph_of(problem, p, config, inert, without=("trunk", "fix", "odometry")).linearize(values)
+    path, trees = _path(problem, values), _trees(problem, values)
+    s, f = problem.sightings, problem.fixes
+    if problem.pose_sigma is None:
+        step = inverse(problem.odom_T_robot[:-1]) @ problem.odom_T_robot[1:]
+        for k, odometry in enumerate(f for kind, f in _motion(problem, inert) if kind == "odometry"):
+            A, b = odometry.linearize(values).jacobian()
+            longer = np.zeros((6, 1))
+            longer[3:, 0] = -step[k, :3, :3].T @ step[k, :3, 3] / problem.step_sigma[k, 3:]
+            g.add(gtsam.JacobianFactor(X + k, A[:, :6], X + k + 1, A[:, 6:], C, longer, b, _unit(6)))
+    if len(s):
+        mount = np.zeros((len(s), 3, 4))
+        mount[:, :, 0] = -s.late
+        mount[:, 0, 1] = mount[:, 1, 2] = -1.0
+        mount[:, 0, 3], mount[:, 1, 3] = s.p[:, 1], -s.p[:, 0]
+        factors.trunk_linear(
+            g, (X + s.keyframe).tolist(), (L + s.tree).tolist(), path[s.keyframe], trees[s.tree], s.p,
+            p.trunk_scale**2 * s.cov, p.trunk, (C + 1, mount),
+        )  # fmt: skip
+    if len(f.keyframe):
+        R = path[f.keyframe, :3, :3]
+        moved = np.concatenate([(R @ f.late[:, :, None]), R[:, :, :2]], axis=2)
+        factors.fix_linear(
+            g, (X + f.keyframe).tolist(), path[f.keyframe], f.keyframe_p_antenna, f.map_p_antenna, _fix_cov(problem, p), p.fix,
+            (C + 2, moved),
+        )  # fmt: skip
+    parts = [("wheel scale", C, [0], problem.pose_sigma is None), ("trunk clock", C + 1, [0], len(s) > 0),
+             ("trunk mount", C + 1, [1, 2], len(s) > 0), ("trunk yaw", C + 1, [3], len(s) > 0),
+             ("fix clock", C + 2, [0], len(f.keyframe) > 0), ("antenna", C + 2, [1, 2], len(f.keyframe) > 0)]  # fmt: skip
+    present = [c for c, there in ((C, problem.pose_sigma is None), (C + 1, len(s) > 0), (C + 2, len(f.keyframe) > 0)) if there]
+    H, eta = g.marginal(present).hessian(gtsam.Ordering(present))
+    size = {C: 1, C + 1: 4, C + 2: 3}
+    at = dict(zip(present, np.cumsum([0] + [size[c] for c in present[:-1]]).tolist(), strict=True))
+    out = []
+    for name, key, rows, there in parts:
+        if not there:
+            continue
+        i = [at[key] + r for r in rows]
+        information = H[np.ix_(i, i)] + 1e-9 * np.eye(len(i))
+        value = np.linalg.solve(information, eta[i])
+        sigma = np.sqrt(np.diag(np.linalg.inv(information)))
+        out.append(Offset(name=name, value=value, sigma=sigma, gain=float(eta[i] @ value)))
+    return tuple(out)
+
+
+def _unit(n: int) -> Any:
+    return gtsam.noiseModel.Unit.Create(n)
+
+
+def _estimate(problem: Problem, config: EstimateConfig, values: Any, p: Pass, linear: Any, seconds: float) -> Estimate:
     poses, trees = _path(problem, values), _trees(problem, values)
     datum_cov = covariance.of_datum(problem, p.fix_scale, config)
     joint = None
@@ -339,7 +396,7 @@ def _estimate(problem: Problem, config: EstimateConfig, values: Any, p: _Pass, l
     )  # fmt: skip
 
 
-def _other_residuals(problem: Problem, values: Any, p: _Pass, config: EstimateConfig) -> dict[str, Array]:
+def _other_residuals(problem: Problem, values: Any, p: Pass, config: EstimateConfig) -> dict[str, Array]:
     poses = _path(problem, values)
     step = inverse(problem.odom_T_robot[:-1]) @ problem.odom_T_robot[1:]
     misfit = log(inverse(step) @ inverse(poses[:-1]) @ poses[1:]) / problem.step_sigma

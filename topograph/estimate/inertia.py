@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,20 +25,20 @@ class Inertia:
     noise: factors.ImuNoise
     gyro_bias: Array
 
-    def add_to(self, g: Any, X: int, V: int, B: int) -> None:
-        """Add the factors for poses X+k, velocities V+k and biases B+k."""
+    def factors(self, X: int, V: int, B: int) -> Iterator[Any]:
+        """The factors of poses X+k, velocities V+k and biases B+k."""
         for k, pim in enumerate(self.preintegrated):
             if pim is not None:
-                g.add(factors.preintegrated((X + k, V + k, B + k), (X + k + 1, V + k + 1, B + k + 1), pim))
+                yield factors.preintegrated((X + k, V + k, B + k), (X + k + 1, V + k + 1, B + k + 1), pim)
             else:
-                g.add(factors.bias_walk(B + k, B + k + 1, float(self.seconds[k]), self.noise))
+                yield factors.bias_walk(B + k, B + k + 1, float(self.seconds[k]), self.noise)
         bias = gtsam.imuBias.ConstantBias(np.zeros(3), self.gyro_bias)
-        g.add(gtsam.PriorFactorConstantBias(B, bias, factors.sigmas([0.15, 0.15, 0.15, 3e-3, 3e-3, 3e-3])))
+        yield gtsam.PriorFactorConstantBias(B, bias, factors.sigmas([0.15, 0.15, 0.15, 3e-3, 3e-3, 3e-3]))
         loose = factors.sigmas([3.0, 3.0, 3.0])
         for k in range(len(self.preintegrated) + 1):
             before = k > 0 and self.preintegrated[k - 1] is not None
             if not before:
-                g.add(gtsam.PriorFactorVector(V + k, np.zeros(3), loose))
+                yield gtsam.PriorFactorVector(V + k, np.zeros(3), loose)
 
 
 def inertia(problem: Problem) -> Inertia | None:

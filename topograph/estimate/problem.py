@@ -56,12 +56,14 @@ class Fixes:
         keyframe: (G,) index.
         keyframe_p_antenna: (G, 3) the antenna at the fix's own stamp, in the keyframe's base frame, m.
         map_p_antenna: (G, 3) ENU, m; `cov` (G, 3, 3).
+        late: (G, 3) change of `keyframe_p_antenna` per second that the receiver's clock would run late, m/s.
     """
 
     keyframe: NDArray[np.int64]
     keyframe_p_antenna: Array
     map_p_antenna: Array
     cov: Array
+    late: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +138,23 @@ class Problem:
     link: Link | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Offset:
+    """A calibration that was taken as given, tested against the residuals.
+
+    Attributes:
+        name: "fix clock", "trunk clock" (s), "antenna" (x, y in the base's frame, m), "trunk mount" (x, y), "trunk yaw" (rad),
+            "wheel scale" (share).
+        value, sigma: (q,) what it would have to be off by, and the standard deviation of that.
+        gain: by how much the sum of squared whitened residuals would fall.
+    """
+
+    name: str
+    value: Array
+    sigma: Array
+    gain: float
+
+
 @dataclass(frozen=True, slots=True)
 class Estimate:
     """Path, trees and what is known of their errors.
@@ -150,6 +169,7 @@ class Estimate:
         weights: (M,) robust weights of the sightings.
         residuals: factor type -> normalised residuals.
         scales: factor type -> factor that its noise was multiplied with.
+        offsets: what a clock, a mounting or the wheels' scale would have to be off by to explain the residuals best.
         seconds: what it took.
     """
 
@@ -164,3 +184,4 @@ class Estimate:
     residuals: dict[str, Array] = field(default_factory=dict)
     scales: dict[str, float] = field(default_factory=dict)
     seconds: float = 0.0
+    offsets: tuple[Offset, ...] = ()

@@ -1,5 +1,6 @@
 """Straight lines: bags to a map, a map and bags to poses. `mapping` holds the one loop (associate <-> solve)."""
 
+from topograph.pipeline.auditing import audited
 from topograph.pipeline.localizing import Replay, localize_bags
 from topograph.pipeline.mapping import (
     Solved,
@@ -17,6 +18,7 @@ __all__ = [
     "Replay",
     "Run",
     "Solved",
+    "audited",
     "baseline",
     "extend",
     "localize_bags",

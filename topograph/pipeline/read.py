@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -13,12 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from topograph.bags import Fix, Heading, Imu, Odometry, Recording, Scan, Trunks
+from topograph.bags import DAMAGED, UNDECODED, Fix, Heading, Imu, Odometry, Recording, Scan, Trunks
 from topograph.config import Config
 from topograph.errors import InputError
 from topograph.geometry import Array, inverse
 from topograph.motion import Streams, StreamsBuilder, twist_during, up_at
 from topograph.trunks import from_recorded, smeared
+
+log = logging.getLogger(__name__)
 
 Progress = Callable[[str, float], None]
 WHOLE = (0.0, float("inf"))
@@ -59,32 +62,58 @@ def stream(
 ) -> Iterator[Trunks | Imu | Odometry | Fix | Heading]:
     """The small messages as they come, and the trunks of each scan as soon as the motion during it is known.
 
-    Only what is stamped within `span_s` (from, to) seconds of the first message is given.
+    Only what was recorded within `span_s` (from, to) seconds of the recording's start is read.
     """
     detect = _detector(recording, config)
     builder = StreamsBuilder()
-    pending: list[Scan] = []
-    newest = first = 0
+    pending: list[tuple[int, Scan]] = []
+    seen: set[int] = set()
     expected = max(1, sum(recording.counts[t] for t in recording.chosen.values()))
-    for n, (_, product) in enumerate(recording.messages()):
+    for n, (kind, product) in enumerate(recording.messages(window_ns=_window(recording, span_s))):
         if n % 200 == 0:
             progress("read", n / expected)
-        first = first or product.stamp_ns
-        if not span_s[0] <= (product.stamp_ns - first) * 1e-9 < span_s[1]:
-            continue
-        newest = max(newest, product.stamp_ns)
+        if isinstance(product, (Scan, Trunks)):
+            if product.stamp_ns in seen:
+                recording.skipped[f"{kind}: repeated stamp"] += 1
+                continue
+            seen.add(product.stamp_ns)
         if isinstance(product, Scan):
-            pending.append(product)
+            pending.append((recording.log_ns, product))
         elif isinstance(product, Trunks):
             yield from_recorded(product, recording.frames.get(product.frame), config.trunks)
         else:
             builder.add(product)
             yield product
-        while pending and newest > pending[0].stamp_ns + 250_000_000:
-            yield detect(pending.pop(0), builder)
-    for scan in pending:
-        yield detect(scan, builder)
+        while pending and recording.log_ns > pending[0][0] + WAIT_NS:
+            yield from _careful(detect, pending.pop(0)[1], builder, recording.skipped)
+    for _, scan in pending:
+        yield from _careful(detect, scan, builder, recording.skipped)
     progress("read", 1.0)
+
+
+WAIT_NS = 250_000_000
+"""After a scan was recorded, its motion has been too: wheels and IMU are late by less."""
+
+
+def _window(recording: Recording, span_s: tuple[float, float]) -> tuple[int, int] | None:
+    """Times of recording (from, to), ns."""
+    if span_s == WHOLE:
+        return None
+    start, stop = (int(min(s, recording.duration_s + 1.0) * 1e9) for s in span_s)
+    if span_s[0] >= recording.duration_s:
+        raise InputError(f"the recording is {recording.duration_s:.0f} s long: nothing lies behind --from {span_s[0]:.0f}")
+    return recording.start_ns + start, recording.start_ns + stop
+
+
+def _careful(
+    detect: Callable[[Scan, StreamsBuilder], Trunks], scan: Scan, builder: StreamsBuilder, skipped: Counter[str]
+) -> Iterator[Trunks]:
+    """The trunks of one scan; one that breaks the front end is counted and does not end the run."""
+    try:
+        yield detect(scan, builder)
+    except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError) as err:
+        skipped["points: the front end failed on it"] += 1
+        log.warning("the scan of %.3f s broke the front end: %r", scan.stamp_ns * 1e-9, err)
 
 
 def read_run(
@@ -115,6 +144,8 @@ def read_run(
                     trunks.append(product)
                 else:
                     builder.add(product)
+        _refuse_damaged(recording, trunks)
+        notes += recording.clocks.notes
         streams = builder.build(recording.skipped)
         mounts: dict[str, Array | None] = {
             k: recording.frames.find(streams.frames[k]) for k in ("imu", "fix", "heading") if k in streams.frames
@@ -142,6 +173,21 @@ def read_run(
         time.perf_counter() - began,
         duration,
     )
+
+
+MOST_DAMAGED = 0.2
+"""Share of a needed stream that may be damaged."""
+
+
+def _refuse_damaged(recording: Recording, trunks: Sequence[Trunks]) -> None:
+    """Raise InputError where a needed stream is mostly damaged: what is left of it would pass for the whole."""
+    for kind in ("points", "trunks", "odometry"):
+        topic = recording.chosen.get(kind)
+        bad = sum(recording.skipped[f"{kind}: {why}"] for why in (DAMAGED, UNDECODED))
+        if topic is None or bad <= MOST_DAMAGED * recording.counts[topic]:
+            continue
+        why = recording.undecoded.get(kind, "the file is damaged; restore a copy of it, or cut the sound part out with --from and --to")
+        raise InputError(f"{topic}: {bad} of {recording.counts[topic]} messages cannot be read ({why})")
 
 
 _NO_TIME = "points: no time per point, not deskewed"
@@ -197,19 +243,24 @@ def _detect_part(
     with Recording(paths, config.bags) as recording:
         detect = _detector(recording, config)
         builder = StreamsBuilder()
-        pending: list[Scan] = []
-        newest = 0
+        pending: list[tuple[int, Scan]] = []
+        seen: set[int] = set()
         window = (max(start_ns - _LAG_NS, recording.start_ns), stop_ns + _LAG_NS)
         for _, product in recording.messages(("points", "odometry", "imu"), window):
-            newest = max(newest, product.stamp_ns)
             if isinstance(product, Scan):
+                repeated = product.stamp_ns in seen
+                seen.add(product.stamp_ns)
                 if start_ns <= recording.log_ns < stop_ns:
-                    pending.append(product)
+                    if repeated:
+                        recording.skipped["points: repeated stamp"] += 1
+                    else:
+                        pending.append((recording.log_ns, product))
             elif isinstance(product, (Imu, Odometry)):
                 builder.add(product)
-            while pending and newest > pending[0].stamp_ns + 250_000_000:
-                out.append(detect(pending.pop(0), builder))
-        out += [detect(s, builder) for s in pending]
+            while pending and recording.log_ns > pending[0][0] + WAIT_NS:
+                out += _careful(detect, pending.pop(0)[1], builder, recording.skipped)
+        for _, scan in pending:
+            out += _careful(detect, scan, builder, recording.skipped)
         return out, Counter({k: v for k, v in recording.skipped.items() if k.startswith("points")})
 
 

@@ -20,6 +20,7 @@ class Sightings:
         keyframe, tree: (M,) indices.
         p: (M, 3) in the keyframe's base frame, m; `cov` (M, 3, 3).
         count: (M,) detections averaged.
+        late: (M, 3) change of `p` per second that the scans' clock would run late, m/s.
     """
 
     keyframe: NDArray[np.int64]
@@ -27,6 +28,7 @@ class Sightings:
     p: Array
     cov: Array
     count: NDArray[np.int64]
+    late: Array
 
     def __len__(self) -> int:
         return len(self.tree)
@@ -39,6 +41,10 @@ def nearest_keyframe(stamps: NDArray[np.int64], keyframes_ns: NDArray[np.int64])
         return np.zeros(len(stamps), np.int64)
     left = right - 1
     return np.where(stamps - keyframes_ns[left] <= keyframes_ns[right] - stamps, left, right)
+
+
+DELAY_NS = 50_000_000
+"""Over which the change of a sighting with its scan's clock is taken."""
 
 
 def gather(
@@ -60,6 +66,8 @@ def gather(
     keyframe_T_scan = inverse(odom_T_keyframe[keyframe_of_scan]) @ odom_T_scan
     T = keyframe_T_scan[detections.scan[keep]]
     p = transform(T, detections.p[keep])
+    later = inverse(odom_T_keyframe[keyframe_of_scan]) @ motion.at(detections.stamps_ns + DELAY_NS)
+    moved = (transform(later[detections.scan[keep]], detections.p[keep]) - p) / (DELAY_NS * 1e-9)
     R = T[:, :3, :3]
     information = np.linalg.inv(R @ detections.cov[keep] @ np.swapaxes(R, 1, 2))
     information *= detections.believed[keep, None, None]
@@ -71,6 +79,7 @@ def gather(
     np.add.at(total, index, information)
     np.add.at(weighted, index, (information @ p[:, :, None])[..., 0])
     mean = np.linalg.solve(total, weighted[..., None])[..., 0] if m else np.zeros((0, 3))
+    late = np.stack([np.bincount(index, moved[:, k], m) for k in range(3)], axis=1) / np.maximum(count, 1)[:, None]
     effective = 1 + independent * (count - 1)
     cov = np.linalg.inv(total) * (count / effective)[:, None, None] if m else np.zeros((0, 3, 3))
-    return Sightings(keyframe[first], tree[keep][first], np.asarray(mean, float), np.asarray(cov, float), count)
+    return Sightings(keyframe[first], tree[keep][first], np.asarray(mean, float), np.asarray(cov, float), count, late)

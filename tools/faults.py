@@ -93,13 +93,21 @@ def write(bag: Bag, path: Path) -> None:
             elif isinstance(m, Fix):
                 w.fix(topic, e.log_ns, m.stamp_ns, m.frame, m.lat_lon_h, m.cov, m.status)
             elif isinstance(m, Heading):
-                q = np.array([0, 0, np.sin(m.yaw / 2), np.cos(m.yaw / 2)]) if np.isfinite(m.yaw) else np.full(4, m.sigma)
+                q = (
+                    np.array([0, 0, np.sin(m.yaw / 2), np.cos(m.yaw / 2)])
+                    if np.isfinite(m.yaw)
+                    else np.full(4, m.sigma)
+                )
                 w.heading(topic, e.log_ns, m.stamp_ns, m.frame, q)
             else:
                 z = np.array([0.0, 0.0, 1.0])
                 v = np.cross(z, m.axis)
                 n = np.linalg.norm(v, axis=1, keepdims=True)
-                q = Rotation.from_rotvec(v / np.maximum(n, 1e-12) * np.arctan2(n, m.axis[:, 2:])).as_quat() if len(m) else np.zeros((0, 4))
+                q = (
+                    Rotation.from_rotvec(v / np.maximum(n, 1e-12) * np.arctan2(n, m.axis[:, 2:])).as_quat()
+                    if len(m)
+                    else np.zeros((0, 4))
+                )
                 w.trunks(topic, e.log_ns, m.stamp_ns, m.frame, m.p, np.nan_to_num(m.diameter), q)
 
 
@@ -148,7 +156,9 @@ def each(kind: str, change: Callable[[Any, float], Any], when: Callable[[float],
 def _clocks() -> None:
     for kind in ("trunks", "odometry", "imu", "fix", "heading"):
         for dt in (-0.5, -0.05, 0.05, 0.2, 0.5, 1.0, 5.0):
-            FAULTS[f"clock {kind} {dt:+g} s"] = each(kind, lambda m, t, dt=dt: replace(m, stamp_ns=m.stamp_ns + int(dt * S)))
+            FAULTS[f"clock {kind} {dt:+g} s"] = each(
+                kind, lambda m, t, dt=dt: replace(m, stamp_ns=m.stamp_ns + int(dt * S))
+            )
 
         def uptime(bag: Bag, rng: np.random.Generator, kind: str = kind) -> None:
             each(kind, lambda m, t: replace(m, stamp_ns=int(m.stamp_ns - bag.start_ns + 1000 * S)))(bag, rng)
@@ -157,7 +167,9 @@ def _clocks() -> None:
         FAULTS[f"zero stamps {kind}"] = each(kind, lambda m, t: replace(m, stamp_ns=0))
         for ahead, what in ((3600 * S, "an hour"), (YEAR, "a year")):
 
-            def one(bag: Bag, rng: np.random.Generator, kind: str = kind, ahead: int = ahead, first: bool = False) -> None:
+            def one(
+                bag: Bag, rng: np.random.Generator, kind: str = kind, ahead: int = ahead, first: bool = False
+            ) -> None:
                 mine = bag.of(kind)
                 e = mine[0 if first else len(mine) // 3]
                 e.it = replace(e.it, stamp_ns=e.it.stamp_ns + ahead)
@@ -257,7 +269,9 @@ def _gnss() -> None:
     FAULTS["fix status -2 (unknown)"] = of(lambda m, t: replace(m, status=-2))
     FAULTS["fix status 0"] = of(lambda m, t: replace(m, status=0))
     for name, value in (("NaN", np.nan), ("0", 0.0), ("inf", np.inf), ("1e300", 1e300), ("95", 95.0)):
-        FAULTS[f"fix lat, lon {name}"] = of(lambda m, t, v=value: replace(m, lat_lon_h=np.array([v, v, m.lat_lon_h[2]])))
+        FAULTS[f"fix lat, lon {name}"] = of(
+            lambda m, t, v=value: replace(m, lat_lon_h=np.array([v, v, m.lat_lon_h[2]]))
+        )
     for name, value in (("NaN", np.nan), ("-2e10", -2e10), ("+500", 500.0)):
         FAULTS[f"fix altitude {name}"] = of(lambda m, t, v=value: replace(m, lat_lon_h=np.array([*m.lat_lon_h[:2], v])))
     FAULTS["fix -2e10 for 4 s"] = of(lambda m, t: replace(m, lat_lon_h=np.full(3, -2e10)), lambda t: t < 4)
@@ -322,7 +336,9 @@ def _imu() -> None:
     FAULTS["imu NED"] = of(lambda m, t: replace(m, gyro=m.gyro * [1, -1, -1], accel=m.accel * [1, -1, -1]))
     FAULTS["imu gyro z flipped"] = of(lambda m, t: replace(m, gyro=m.gyro * [1, 1, -1]))
     FAULTS["imu gyro scaled by 1.1"] = of(lambda m, t: replace(m, gyro=1.1 * m.gyro))
-    FAULTS["imu NaN half"] = each("imu", lambda m, t: replace(m, gyro=np.full(3, np.nan)), lambda t: int(t * 100) % 2 == 0)
+    FAULTS["imu NaN half"] = each(
+        "imu", lambda m, t: replace(m, gyro=np.full(3, np.nan)), lambda t: int(t * 100) % 2 == 0
+    )
     FAULTS["imu NaN"] = of(lambda m, t: replace(m, gyro=np.full(3, np.nan)))
     FAULTS["imu bias 0.2 rad/s"] = of(lambda m, t: replace(m, gyro=m.gyro + [0, 0, 0.2]))
     FAULTS["imu frozen"] = of(lambda m, t: replace(m, gyro=np.array([0.01, 0, 0.02]), accel=np.array([0.1, 0, 9.8])))
@@ -367,7 +383,9 @@ def _wheels() -> None:
     FAULTS["odometry NaN for 2 s"] = moved(lambda p, t: np.full(7, np.nan), lambda t: 20 < t < 22)
     FAULTS["odometry quaternions zero"] = moved(lambda p, t: np.array([*p[:3], 0, 0, 0, 0]), lambda t: True)
     FAULTS["odometry pose zero, twist good"] = moved(lambda p, t: np.array([0, 0, 0, 0, 0, 0, 1.0]), lambda t: True)
-    FAULTS["odometry frozen"] = each("odometry", lambda m, t: replace(m, odom_T_child=np.array([1, 2, 0, 0, 0, 0, 1.0]), twist=np.zeros(6)))
+    FAULTS["odometry frozen"] = each(
+        "odometry", lambda m, t: replace(m, odom_T_child=np.array([1, 2, 0, 0, 0, 0, 1.0]), twist=np.zeros(6))
+    )
     FAULTS["odometry backwards"] = moved(lambda p, t: p * [-1, -1, 1, 1, 1, 1, 1], lambda t: True)
 
     @fault("odometry reset half way")
@@ -395,11 +413,19 @@ def _things() -> None:
                 T = interpolate(bag.truth.stamps_ns, bag.truth.world_T_robot, [e.it.stamp_ns])[0]
                 p = where(T, bag.at(e)) + rng.normal(0, 0.02, 3)
                 m = e.it
-                e.it = replace(m, p=np.vstack([m.p, p]), axis=np.vstack([m.axis, [0, 0, 1.0]]), diameter=np.append(m.diameter, 0.2), score=np.append(m.score, 0.0))
+                e.it = replace(
+                    m,
+                    p=np.vstack([m.p, p]),
+                    axis=np.vstack([m.axis, [0, 0, 1.0]]),
+                    diameter=np.append(m.diameter, 0.2),
+                    score=np.append(m.score, 0.0),
+                )
 
         return run
 
-    FAULTS["a person beside the robot"] = add(lambda T, t: np.array([0.5 * np.sin(t / 3), 1.5 + 0.3 * np.sin(t / 7), 0.8]))
+    FAULTS["a person beside the robot"] = add(
+        lambda T, t: np.array([0.5 * np.sin(t / 3), 1.5 + 0.3 * np.sin(t / 7), 0.8])
+    )
     FAULTS["a mast on the robot"] = add(lambda T, t: np.array([-0.9, 0.3, 0.8]))
     FAULTS["a trailer"] = add(lambda T, t: np.array([-2.5, 0.1 * np.sin(t), 0.8]))
     FAULTS["a person overtakes"] = add(lambda T, t: np.array([-10 + 0.5 * t, 1.2, 0.8]))
@@ -411,7 +437,9 @@ def _things() -> None:
 
         return run
 
-    FAULTS["trunks NaN now and then"] = per_trunk(lambda m, r: replace(m, p=np.where(r.random((len(m), 1)) < 0.1, np.nan, m.p)))
+    FAULTS["trunks NaN now and then"] = per_trunk(
+        lambda m, r: replace(m, p=np.where(r.random((len(m), 1)) < 0.1, np.nan, m.p))
+    )
     FAULTS["trunks mirrored"] = per_trunk(lambda m, r: replace(m, p=m.p * [1, -1, 1]))
     FAULTS["trunks scaled by 1.05"] = per_trunk(lambda m, r: replace(m, p=m.p * [1.05, 1.05, 1]))
     FAULTS["trunks in centimetres"] = per_trunk(lambda m, r: replace(m, p=m.p * 100))
@@ -421,7 +449,13 @@ def _things() -> None:
 
 
 def _sites() -> None:
-    for name, lat, lon in (("equator", 0.0005, 10.0), ("Greenwich", 51.0, 0.0001), ("180", 10.0, 179.9999), ("85 north", 85.0, 20.0), ("north pole", 89.9999, 0.0)):
+    for name, lat, lon in (
+        ("equator", 0.0005, 10.0),
+        ("Greenwich", 51.0, 0.0001),
+        ("180", 10.0, 179.9999),
+        ("85 north", 85.0, 20.0),
+        ("north pole", 89.9999, 0.0),
+    ):
 
         def site(bag: Bag, rng: np.random.Generator, lat: float = lat, lon: float = lon) -> None:
             from topograph.geometry import Datum
@@ -488,7 +522,9 @@ def attempt(name: str, bag: Bag, path: Path) -> Outcome:
         return Outcome(name, "refused", f"{type(err).__name__}: {err}", False, 0, 0, 0.0, 0.0, 0)
     except Exception as err:  # noqa: BLE001  # what the suite is there to find
         where = traceback.extract_tb(err.__traceback__)[-1]
-        return Outcome(name, "traceback", f"{type(err).__name__}: {err} ({where.filename}:{where.lineno})", True, 0, 0, 0.0, 0.0, 0)
+        return Outcome(
+            name, "traceback", f"{type(err).__name__}: {err} ({where.filename}:{where.lineno})", True, 0, 0, 0.0, 0.0, 0
+        )
     says = "; ".join(verdict.reasons or tuple(run.notes))
     if not len(topo):
         return Outcome(name, "refused", f"no trees; {says}", False, 0, 0, 0.0, 0.0, missing)
@@ -502,7 +538,11 @@ def attempt(name: str, bag: Bag, path: Path) -> Outcome:
     off = 0.0
     if topo.datum is not None:
         true = interpolate(bag.truth.stamps_ns, bag.truth.world_T_robot, est.stamps_ns)[:, :3, 3]
-        off = float(np.linalg.norm((est.map_T_robot[:, :3, 3] - topo.datum.to_enu(bag.truth.datum.to_geodetic(true)))[:, :2], axis=1).max())
+        off = float(
+            np.linalg.norm(
+                (est.map_T_robot[:, :3, 3] - topo.datum.to_enu(bag.truth.datum.to_geodetic(true)))[:, :2], axis=1
+            ).max()
+        )
     seen = len(bag.truth.trees)
     return Outcome(name, verdict.word, says, wrong, ghosts, seen - len(i), float(error.max(initial=0)), off, missing)
 
@@ -537,8 +577,14 @@ def main() -> None:
         work.mkdir(parents=True, exist_ok=True)
         out = suite(names, a.seed, work)
     for o in out:
-        print(f"{o.kind:<15} {o.name:<38} ghosts {o.ghosts:>2} lost {o.lost:>2} worst {o.worst:5.2f} path {o.path:6.2f} missing {o.missing:>5}  {o.says[:170]}")
-    print("\n" + ", ".join(f"{k} {n}" for k, n in sorted(Counter(o.kind for o in out).items())) + f"; {len(out)} faults, seed {a.seed}")
+        print(
+            f"{o.kind:<15} {o.name:<38} ghosts {o.ghosts:>2} lost {o.lost:>2} worst {o.worst:5.2f} path {o.path:6.2f} missing {o.missing:>5}  {o.says[:170]}"
+        )
+    print(
+        "\n"
+        + ", ".join(f"{k} {n}" for k, n in sorted(Counter(o.kind for o in out).items()))
+        + f"; {len(out)} faults, seed {a.seed}"
+    )
 
 
 if __name__ == "__main__":

@@ -9,4 +9,16 @@ from topograph.bags.recording import DAMAGED, UNDECODED, Recording
 from topograph.bags.scan import Scan
 from topograph.bags.scan import decode as decode_scan
 
-__all__ = ["DAMAGED", "UNDECODED", "BagsConfig", "Fix", "Heading", "Imu", "Odometry", "Recording", "Scan", "Trunks", "decode_scan"]
+__all__ = [
+    "DAMAGED",
+    "UNDECODED",
+    "BagsConfig",
+    "Fix",
+    "Heading",
+    "Imu",
+    "Odometry",
+    "Recording",
+    "Scan",
+    "Trunks",
+    "decode_scan",
+]

@@ -37,8 +37,6 @@ class Stamped(Protocol):
     def stamp_ns(self) -> int: ...
 
 
-
-
 @dataclass(slots=True)
 class Message:
     """A product of stream `kind`, and when it was recorded."""

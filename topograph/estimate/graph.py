@@ -108,7 +108,9 @@ def _poses_alone(problem: Problem, poses: Array, config: EstimateConfig) -> Arra
     values = _values(problem, poses, np.zeros((0, 3)), None)
     if len(problem.fixes.keyframe) >= 3:
         for p in (Pass(_NONE, Kernel("huber", 1.345), 1.0), Pass(_NONE, Kernel("cauchy", 1.0), 0.1)):
-            values = levenberg_marquardt(graph_of(problem, p, config, None, without=("trunk", "tree")), values, 30, 1e-4)
+            values = levenberg_marquardt(
+                graph_of(problem, p, config, None, without=("trunk", "tree")), values, 30, 1e-4
+            )
     return _path(problem, values)
 
 
@@ -359,7 +361,9 @@ def _tested(
     parts = [("wheel scale", C, [0], problem.pose_sigma is None), ("trunk clock", C + 1, [0], len(s) > 0),
              ("trunk mount", C + 1, [1, 2], len(s) > 0), ("trunk yaw", C + 1, [3], len(s) > 0),
              ("fix clock", C + 2, [0], len(f.keyframe) > 0), ("antenna", C + 2, [1, 2], len(f.keyframe) > 0)]  # fmt: skip
-    present = [c for c, there in ((C, problem.pose_sigma is None), (C + 1, len(s) > 0), (C + 2, len(f.keyframe) > 0)) if there]
+    present = [
+        c for c, there in ((C, problem.pose_sigma is None), (C + 1, len(s) > 0), (C + 2, len(f.keyframe) > 0)) if there
+    ]
     H, eta = g.marginal(present).hessian(gtsam.Ordering(present))
     size = {C: 1, C + 1: 4, C + 2: 3}
     at = dict(zip(present, np.cumsum([0] + [size[c] for c in present[:-1]]).tolist(), strict=True))

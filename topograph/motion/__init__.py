@@ -1,9 +1,10 @@
 """Odometry + Imu -> Motion: where dead reckoning says the robot is, at any stamp. No map, no trunks."""
 
 from topograph.motion.gravity import up_at
-from topograph.motion.inertial import Inertial, align_imu
+from topograph.motion.inertial import Inertial, align_imu, mount_turn
 from topograph.motion.online import Leg, Reckoner
 from topograph.motion.reckon import Motion, MotionConfig, dead_reckon
+from topograph.motion.samples import without_nonsense
 from topograph.motion.streams import Streams, StreamsBuilder
 from topograph.motion.twist import twist_during
 
@@ -17,6 +18,8 @@ __all__ = [
     "StreamsBuilder",
     "align_imu",
     "dead_reckon",
+    "mount_turn",
     "twist_during",
     "up_at",
+    "without_nonsense",
 ]

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
-from topograph.geometry import Array, Stamps, se3
+from topograph.geometry import Array, Stamps, se3, yaw_of
+from topograph.motion.rates import ALIKE, compare, outside_rate, wheel_rate
 from topograph.motion.streams import Streams
-
-log = logging.getLogger(__name__)
 
 GRAVITY = 9.80665
 
@@ -26,7 +24,6 @@ class Inertial:
         robot_T_imu: (4, 4); the lever arm is its translation.
         gyro_bias: (3,) mean rate at rest, rad/s.
         gyro_density, accel_density: white noise, rad/s/√Hz and m/s²/√Hz, measured from the samples.
-        note: how the mounting was found, "" when it was given.
     """
 
     stamps_ns: Stamps
@@ -36,37 +33,102 @@ class Inertial:
     gyro_bias: Array
     gyro_density: float
     accel_density: float
-    note: str
 
 
-def align_imu(streams: Streams, robot_T_imu: Array | None) -> Inertial | None:
-    """The IMU's stream in the robot's axes; None when there are too few samples to use.
+UPSIDE = 0.6
+"""Gravity further from the base's vertical than this, rad, is not a slope but a wrong mounting."""
+LATE = 0.1
+"""Clocks of gyro and wheels that differ by more are said and set right, s."""
+DEGREES = (45.0, 70.0)
+"""Slope of a gyro in degrees on wheels in radians."""
 
-    With no mounting given, the tilt is taken from the mean specific force and the turn about the vertical from
-    the wheels' acceleration (forward: dv/dt, sideways: v·ω), where the wheels say enough.
+
+def align_imu(streams: Streams, robot_T_imu: Array | None) -> tuple[Inertial | None, Streams, list[str]]:
+    """The IMU's stream in the robot's axes (None where it cannot be used), the streams with clocks set right, and what to say.
+
+    With no mounting given, the tilt is taken from the mean specific force and the turn about the vertical from the wheels'
+    acceleration (forward: dv/dt, sideways: v·ω), where the wheels say enough. An IMU that contradicts gravity, or both the
+    wheels and the heading, is left out: a wrong one costs more than none.
     """
     if len(streams.imu_ns) < 20:
-        return None
-    note = ""
+        return None, streams, []
+    notes: list[str] = []
     if robot_T_imu is None:
         R, note = _find_mounting(streams)
         robot_T_imu = se3(R, np.zeros(3))
+        notes.append(note)
     R = robot_T_imu[:3, :3]
     gyro, accel = streams.gyro @ R.T, streams.accel @ R.T
     size = float(np.median(np.linalg.norm(accel, axis=1)))
     if 0.8 < size < 1.2:  # some drivers report g
         accel = accel * GRAVITY
-        note += "; specific force was in g"
+        notes.append("IMU: specific force was in g")
     elif not 8.5 < size < 11.5:
-        log.warning("the IMU's specific force is %.2f m/s² at the median, not gravity: it is left out", size)
-        return None
+        return (
+            None,
+            streams,
+            [f"the IMU's specific force is {size:.2f} m/s² at the median, not gravity: the IMU is left out"],
+        )
+    mean = np.median(accel, axis=0)
+    tilt = float(np.arccos(np.clip(mean[2] / np.linalg.norm(mean), -1, 1)))
+    if tilt > UPSIDE:
+        return (
+            None,
+            streams,
+            [
+                f"gravity is {np.degrees(tilt):.0f}° from where the IMU's mounting puts it: the IMU is left out (mend its transform, or its axes: z is up)"
+            ],
+        )
+    streams, gyro, said, usable = _against_wheels(streams, gyro)
+    notes += said
+    if not usable:
+        return None, streams, notes
     dt = float(np.median(np.diff(streams.imu_ns))) * 1e-9
     bias = _bias(streams, gyro, dt)
     root = np.sqrt(dt)
-    return Inertial(
+    inertial = Inertial(
         streams.imu_ns, gyro, accel, robot_T_imu, bias,
-        max(_white(gyro) * root, 1e-4), max(_white(accel) * root, 2e-3), note.strip("; "),
+        max(_white(gyro) * root, 1e-4), max(_white(accel) * root, 2e-3),
     )  # fmt: skip
+    return inertial, streams, notes
+
+
+def _against_wheels(streams: Streams, gyro: Array) -> tuple[Streams, Array, list[str], bool]:
+    """Streams with gyro's or wheels' clock set right, the gyro in rad/s, what to say, and whether the gyro can be used."""
+    if len(streams.odometry_ns) < 50:
+        return streams, gyro, [], True
+    by_wheels = compare(streams.imu_ns, gyro[:, 2], *wheel_rate(streams))
+    if by_wheels is None:
+        return streams, gyro, [], True
+    if by_wheels.correlation > ALIKE and DEGREES[0] < by_wheels.slope < DEGREES[1]:
+        return streams, np.radians(gyro), ["the gyro speaks in degrees per second: converted"], True
+    outside = outside_rate(streams)
+    by_outside = compare(streams.imu_ns, gyro[:, 2], *outside) if outside is not None else None
+    if by_wheels.right:
+        if abs(by_wheels.lag) < LATE:
+            return streams, gyro, [], True
+        if by_outside is not None and by_outside.right and abs(by_outside.lag) < 0.5 * abs(by_wheels.lag):
+            moved = replace(streams, odometry_ns=streams.odometry_ns + int(1e9 * by_wheels.lag))
+            return moved, gyro, [_late("wheels", -by_wheels.lag, "gyro and the heading")], True
+        moved = replace(streams, imu_ns=streams.imu_ns - int(1e9 * by_wheels.lag))
+        return moved, gyro, [_late("IMU", by_wheels.lag, "wheels")], True
+    if by_outside is not None and by_outside.right:
+        return streams, gyro, [], True  # it is the wheels that turn otherwise
+    return streams, gyro, [
+        f"gyro and wheels tell of different turns (correlation {by_wheels.correlation:.2f}, slope {by_wheels.slope:.2f}): the IMU is left out "
+        "(check its mounting, its axes and its units)"
+    ], False  # fmt: skip
+
+
+def _late(what: str, lag: float, other: str) -> str:
+    word = "late" if lag > 0 else "early"
+    return f"the {what} clock is {abs(lag):.2f} s {word} against the {other}: set right (synchronise the clocks)"
+
+
+def mount_turn(streams: Streams, robot_T_imu: Array) -> tuple[float, float]:
+    """Turn about the vertical by which the IMU's accelerations want its mounting otherwise, rad, and its standard deviation."""
+    R = robot_T_imu[:3, :3]
+    return _turn_from_wheels(streams, streams.accel @ R.T, streams.gyro @ R.T)
 
 
 def _white(x: Array) -> float:
@@ -100,34 +162,50 @@ def _find_mounting(streams: Streams) -> tuple[NDArray[np.float64], str]:
     up = mean / np.linalg.norm(mean)
     tilt = float(np.arccos(np.clip(up[2], -1, 1)))
     if tilt < 0.17:
-        return np.eye(3), "IMU frame unknown: taken as parallel to the base"
+        return _with_turn(streams, np.eye(3), "IMU frame unknown: taken as level")
     axis = np.cross(up, [0, 0, 1])
     n = float(np.linalg.norm(axis))
     axis = axis / n if n > 1e-9 else np.array([1.0, 0.0, 0.0])
     R = Rotation.from_rotvec(axis * tilt).as_matrix()
-    turn, trust = _turn_from_wheels(streams, streams.accel @ R.T, streams.gyro @ R.T)
-    note = f"IMU frame unknown: tilted by {np.degrees(tilt):.0f}° from gravity"
-    if trust > 0.15:
-        R = Rotation.from_euler("z", turn).as_matrix() @ R
-        return R, f"{note}, turned by {np.degrees(turn):.0f}° from the wheels (correlation {trust:.2f})"
-    return R, f"{note}; its turn about the vertical could not be found"
+    return _with_turn(streams, R, f"IMU frame unknown: tilted by {np.degrees(tilt):.0f}° from gravity")
+
+
+def _with_turn(streams: Streams, R: Array, note: str) -> tuple[NDArray[np.float64], str]:
+    """A mounting (3, 3) turned about the vertical by the quarter that the wheels' accelerations tell, where they do."""
+    turn, sigma = _turn_from_wheels(streams, streams.accel @ R.T, streams.gyro @ R.T)
+    quarter = np.round(turn / (np.pi / 2)) * (np.pi / 2)
+    if sigma > 0.35 or abs(turn - quarter) > 0.6:
+        return R, f"{note}; its turn about the vertical could not be found: give it with --extrinsic"
+    return Rotation.from_euler(
+        "z", quarter
+    ).as_matrix() @ R, f"{note}, turned by {np.degrees(quarter):.0f}° from the wheels"
 
 
 def _turn_from_wheels(streams: Streams, accel: Array, gyro: Array) -> tuple[float, float]:
-    """Turn (rad) that makes horizontal specific force agree with the wheels, and the correlation reached."""
+    """Turn (rad) that makes horizontal specific force agree with the wheels, and its standard deviation; (0, inf) unknown.
+
+    Least squares over turn, slope of the ground and biases: on a slope gravity's share turns with the heading.
+    """
+    unknown = (0.0, float("inf"))
     if len(streams.odometry_ns) < 50:
-        return 0.0, 0.0
+        return unknown
     t = np.arange(streams.odometry_ns[0], streams.odometry_ns[-1], 100_000_000)
     if len(t) < 50:
-        return 0.0, 0.0
+        return unknown
     s = (streams.imu_ns[-1] - streams.imu_ns[0]) / max(len(streams.imu_ns) - 1, 1)
     n = max(1, int(5e8 / s))
     ax, ay = (np.interp(t, streams.imu_ns, uniform_filter1d(accel[:, k], n)) for k in (0, 1))
     w = np.interp(t, streams.imu_ns, uniform_filter1d(gyro[:, 2], n))
     v = uniform_filter1d(np.interp(t, streams.odometry_ns, streams.twist[:, 0]), 5)
-    forward, sideways = np.gradient(v, 0.1), v * w
-    ax, ay = ax - ax.mean(), ay - ay.mean()
-    # Rotating (ax, ay) by `turn` should give (forward, sideways).
-    c, d = np.sum(ax * forward + ay * sideways), np.sum(ax * sideways - ay * forward)
-    size = np.sqrt(np.sum(ax**2 + ay**2) * np.sum(forward**2 + sideways**2))
-    return float(np.arctan2(d, c)), float(np.hypot(c, d) / max(size, 1e-12))
+    yaw = np.interp(t, streams.odometry_ns, np.unwrap(yaw_of(streams.odom_T_child)))
+    c, d, one, none = np.cos(yaw), np.sin(yaw), np.ones(len(t)), np.zeros(len(t))
+    A = np.concatenate([np.stack([ax, -ay, -c, -d, -one, none], axis=1), np.stack([ay, ax, d, -c, none, -one], axis=1)])
+    b = np.concatenate([np.gradient(v, 0.1), v * w])
+    x = np.linalg.lstsq(A, b, rcond=None)[0]
+    size = float(np.hypot(x[0], x[1]))
+    if size < 0.05:
+        return unknown
+    r = b - A @ x
+    alike = 2 * n * s / 1e8  # samples are averages, so neighbours are alike
+    cov = np.linalg.pinv(A.T @ A) * float(r @ r) / len(b) * max(alike, 1.0)
+    return float(np.arctan2(x[1], x[0])), float(np.sqrt(max(cov[0, 0], cov[1, 1]))) / size

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numba import njit
@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter1d
 from topograph.geometry import Array, Datum, Stamps, exp, from_quaternion, interpolate, inverse, log, planar, yaw_of
 from topograph.motion.inertial import GRAVITY, Inertial
 from topograph.motion.streams import Streams
+from topograph.motion.wheels import against_fixes
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +49,9 @@ class Motion:
         turned: (M,) radians turned, both ways counted as positive.
         gyro: the turn is the gyro's.
         wheels: the distance is the wheels'.
+        doubt: (M,) m, what slips add to the deviation of the steps, summed up; () where there were none.
+        wheel_scale: what the wheels were multiplied with, since fixes told so.
+        slips: (S, 3) from, to (s since the first stamp) and the robot's speed less the wheels', m/s.
     """
 
     stamps_ns: Stamps
@@ -56,6 +60,9 @@ class Motion:
     turned: Array
     gyro: bool
     wheels: bool
+    doubt: Array = field(default_factory=lambda: np.zeros(0))
+    wheel_scale: float = 1.0
+    slips: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     def at(self, stamps_ns: Stamps) -> Array:
         """Poses (K, 4, 4) at any stamps; outside the recording the nearest end holds."""
@@ -83,25 +90,74 @@ class Motion:
         along, across, up = (k * d + config.step for k in (config.along, config.across, config.up))
         if not self.wheels:
             along = across = up = 0.5 * dt + 0.05
+        if len(self.doubt):
+            along = np.hypot(along, np.diff(np.interp(stamps_ns, self.stamps_ns, self.doubt)))
         return np.stack([tilt, tilt, yaw, along, across, up], axis=1)
 
 
 def dead_reckon(
-    streams: Streams, inertial: Inertial | None, child_T_robot: Array, config: MotionConfig
+    streams: Streams,
+    inertial: Inertial | None,
+    child_T_robot: Array,
+    config: MotionConfig,
+    robot_p_antenna: Array | None = None,
 ) -> Motion | None:
     """Motion of the base from what there is: wheels and IMU, wheels alone, or GNSS (with the gyro's turns, if any).
 
+    Where good fixes contradict the wheels (`motion.wheels`), the fixes' speed stands in. `robot_p_antenna` (3,) m.
     None when nothing tells the distance: neither wheels nor at least ten fixes.
     """
-    n = len(streams.odometry_ns)
-    if n < 2:
+    if len(streams.odometry_ns) < 2:
         return _from_fixes(streams, inertial, config)
-    odom_T_robot = streams.odom_T_child @ child_T_robot
-    step = inverse(odom_T_robot[:-1]) @ odom_T_robot[1:]
-    step = _without_jumps(step, np.diff(streams.odometry_ns) * 1e-9)
-    distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(step[:, :3, 3], axis=1))])
+    step = _steps(streams, child_T_robot)
+    if _stands_still(streams, step):
+        return _from_fixes(streams, inertial, config)
     overlap = inertial is not None and _overlap(inertial.stamps_ns, streams.odometry_ns) > 0.8
-    if inertial is None or not overlap:
+    gyro = inertial if overlap else None
+    motion = _joined(streams, step, gyro, config)
+    check = against_fixes(streams, motion.odom_T_robot, np.zeros(3) if robot_p_antenna is None else robot_p_antenna)
+    if check.scale == 1.0 and not len(check.slips):
+        return motion
+    step[:, :3, 3] *= check.factor[:, None]
+    step[:, 0, 3] += check.advance
+    doubt = np.concatenate([[0.0], np.cumsum(check.doubt)])
+    return replace(
+        _joined(streams, step, gyro, config), doubt=doubt if check.doubt.any() else np.zeros(0), wheel_scale=check.scale,
+        slips=check.slips,
+    )  # fmt: skip
+
+
+STANDS = (0.5, 5.0)
+"""Wheels that never went further while the fixes went so far, m, are dead."""
+
+
+def _stands_still(streams: Streams, step: Array) -> bool:
+    """Wheels that stand while good fixes travel."""
+    if len(streams.fix_ns) < 10 or float(np.linalg.norm(step[:, :3, 3], axis=1).sum()) > STANDS[0]:
+        return False
+    lat, lon, h = (float(v) for v in np.median(streams.lat_lon_h, axis=0))
+    enu = Datum(lat, lon, h).to_enu(streams.lat_lon_h)[:, :2]
+    reach = np.percentile(np.linalg.norm(enu - np.median(enu, axis=0), axis=1), 90)
+    return bool(reach > STANDS[1])
+
+
+def _steps(streams: Streams, child_T_robot: Array) -> Array:
+    """Motion (O-1, 4, 4) of the base between odometry's messages; from their twists where their poses never change."""
+    odom_T_robot = streams.odom_T_child @ child_T_robot
+    dt = np.diff(streams.odometry_ns) * 1e-9
+    step = inverse(odom_T_robot[:-1]) @ odom_T_robot[1:]
+    still = np.abs(streams.odom_T_child - streams.odom_T_child[0]).max() < 1e-6
+    if still and np.abs(streams.twist).max() > 0.05:  # some drivers fill in the twist alone
+        twist = 0.5 * (streams.twist[:-1] + streams.twist[1:])[:, [3, 4, 5, 0, 1, 2]] * np.minimum(dt, 0.5)[:, None]
+        step = inverse(child_T_robot) @ exp(twist) @ child_T_robot
+    return _without_jumps(step, dt)
+
+
+def _joined(streams: Streams, step: Array, inertial: Inertial | None, config: MotionConfig) -> Motion:
+    """The wheels' steps, end to end; along the gyro's heading where there is one."""
+    n = len(streams.odometry_ns)
+    distance = np.concatenate([[0.0], np.cumsum(np.linalg.norm(step[:, :3, 3], axis=1))])
+    if inertial is None:
         T = np.empty((n, 4, 4))
         T[0] = np.eye(4)
         for k in range(n - 1):

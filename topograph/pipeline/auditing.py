@@ -2,10 +2,52 @@
 
 from __future__ import annotations
 
-from topograph.audit import Verdict
+import numpy as np
+
+from topograph import audit
+from topograph.audit import Finding, Verdict
+from topograph.motion import mount_turn
 from topograph.pipeline.mapping import Solved
 
 
 def audited(solved: Solved) -> Verdict:
     """Whether to believe it."""
-    return Verdict()
+    p, e = solved.problem, solved.estimate
+    found = [
+        *audit.offsets(p, e),
+        *audit.fixes(p, e),
+        *audit.standing(solved.streams, solved.motion),
+        *audit.headings(p, e),
+        *audit.trunks(p, e, solved.moving),
+        *_mounts(solved),
+    ]
+    return Verdict(tuple(sorted(found, key=lambda f: (not f.refuses, -f.value / f.bound))))
+
+
+TURNED = np.radians(45.0)
+"""An IMU whose accelerations fit a mounting turned by more than this is mounted otherwise than was said."""
+
+
+def _mounts(solved: Solved) -> list[Finding]:
+    """Mountings that nobody gave, and the IMU's."""
+    out = []
+    run = solved.run
+    if solved.problem.datum is not None and run.mounts.get("fix", 0) is None:
+        out.append(
+            Finding(
+                name="antenna unknown", value=1.0, bound=0.0001, unit="",
+                sentence=f"nobody says where the antenna sits (frame {run.streams.frames['fix']!r} is not in TF): the map lies off by its lever arm; "
+                f"add --extrinsic {run.streams.frames['fix'] or 'FRAME'}=X,Y,Z,ROLL,PITCH,YAW",
+            )
+        )  # fmt: skip
+    mount = run.mounts.get("imu")
+    if mount is not None and solved.problem.inertial is not None:
+        turn, sigma = mount_turn(solved.streams, mount)
+        if abs(turn) > max(TURNED, 3.0 * sigma) and sigma < 0.5:
+            out.append(
+                Finding(
+                    name="imu turned", value=abs(turn), bound=TURNED, unit="rad",
+                    sentence=f"the IMU's accelerations fit a mounting turned by {np.degrees(turn):.0f}° ± {np.degrees(sigma):.0f}° from what TF says",
+                )
+            )  # fmt: skip
+    return out

@@ -14,7 +14,7 @@ from topograph.estimate import Estimate, KnownTrees, Link, Problem, average, gra
 from topograph.estimate.assemble import assemble, choose_datum
 from topograph.evaluate import Metric, fix_metrics
 from topograph.geometry import Array, inverse, transform
-from topograph.motion import Motion, align_imu, dead_reckon
+from topograph.motion import Motion, Streams, align_imu, dead_reckon, without_nonsense
 from topograph.pipeline.read import Progress, Run, silent
 from topograph.topomap import TopoMap, build, merge
 from topograph.trees import (
@@ -37,7 +37,7 @@ from topograph.trees import (
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Solved:
     """A run's problem and its estimate, with the associations they rest on.
 
@@ -45,12 +45,15 @@ class Solved:
         tree: (N,) tree of each detection (-1: none), numbered as in the estimate.
         existence, shapes: of the trees, (T,) rows.
         problem, estimate, motion, detections, run: the products on the way.
+        streams: the small streams as they were used: without nonsense, clocks set right.
+        moving: share of the detections that were of things that moved or rode along.
         held_out: (H,) indices of the fixes withheld from the estimator.
         rejected: trees that did not exist.
         loops: loops closed.
     """
 
     run: Run
+    streams: Streams
     motion: Motion
     detections: Detections
     problem: Problem
@@ -61,6 +64,7 @@ class Solved:
     held_out: NDArray[np.int64]
     rejected: int
     loops: int
+    moving: float
     seconds: dict[str, float]
 
 
@@ -81,10 +85,13 @@ def solve_run(
     """
     began = time.perf_counter()
     notes, skipped = run.notes, run.skipped
-    inertial = align_imu(run.streams, run.mounts.get("imu")) if "imu" in run.mounts else None
-    if inertial is not None and inertial.note:
-        notes.append(inertial.note)
-    motion = dead_reckon(run.streams, inertial, run.child_T_robot, config.motion)
+    streams = without_nonsense(run.streams, skipped)
+    inertial = None
+    if "imu" in run.mounts:
+        inertial, streams, said = align_imu(streams, run.mounts["imu"])
+        notes += said
+    antenna, baseline = (_or(run.mounts.get(k), np.eye(4)) for k in ("fix", "heading"))
+    motion = dead_reckon(streams, inertial, run.child_T_robot, config.motion, antenna[:3, 3])
     if motion is None:
         raise InsufficientDataError(
             "no wheel odometry and fewer than ten usable fixes: the distance between scans is unknown; "
@@ -92,9 +99,10 @@ def solve_run(
         )
     if not motion.wheels:
         notes.append("no wheel odometry: the motion between poses rests on GNSS fixes, IMU and trunks")
+    notes += _wheel_notes(motion)
     if not motion.gyro:
         notes.append("no IMU: turns rest on the wheels, the slope on GNSS and trunks")
-    detections, track = _screened(Detections.of(run.trunks), motion, config, notes)
+    detections, track, moving = _screened(Detections.of(run.trunks), motion, config, notes)
     n_fix = len(run.streams.fix_ns)
     used = np.ones(n_fix, bool)
     if check_fixes > 0:
@@ -109,10 +117,9 @@ def solve_run(
     if datum is None:
         notes.append("no usable GNSS fixes: the map is not georeferenced")
     keyframes = _keyframes(detections, motion, config)
-    eye = np.eye(4)
     problem = assemble(
-        keyframes, motion, config.motion, inertial, run.streams, used, _or(run.mounts.get("fix"), eye),
-        _or(run.mounts.get("heading"), eye), datum, detections, config.estimate, skipped,
+        keyframes, motion, config.motion, inertial, streams, used, antenna, baseline, datum, detections,
+        config.estimate, skipped,
     )  # fmt: skip
     if known is not None:
         problem = replace(problem, known=_known_trees(known, detections))
@@ -121,31 +128,50 @@ def solve_run(
     problem = decided.problem
     seconds["associate and solve"] = time.perf_counter() - began
     return Solved(
-        run,
-        motion,
-        problem.detections,
-        problem,
-        estimate,
-        decided.tree,
-        decided.existence,
-        decided.shapes,
-        np.flatnonzero(~used),
-        decided.rejected,
-        loops,
-        seconds,
+        run=run,
+        streams=streams,
+        motion=motion,
+        detections=problem.detections,
+        problem=problem,
+        estimate=estimate,
+        tree=decided.tree,
+        existence=decided.existence,
+        shapes=decided.shapes,
+        held_out=np.flatnonzero(~used),
+        rejected=decided.rejected,
+        loops=loops,
+        moving=moving,
+        seconds=seconds,
     )
+
+
+def _wheel_notes(motion: Motion) -> list[str]:
+    out = []
+    if motion.wheel_scale != 1.0:
+        off = 100 * (1 / motion.wheel_scale - 1)
+        word = "overstate" if off > 0 else "understate"
+        out.append(f"wheels {word} distances by {abs(off):.0f} % against the fixes: corrected (calibrate their radius)")
+    for begin, end, speed in motion.slips[:5].tolist():
+        out.append(
+            f"wheels slipped or were blocked from {begin:.1f} to {end:.1f} s (off by {-speed:+.2f} m/s): "
+            "the fixes' speed stands in"
+        )
+    if len(motion.slips) > 5:
+        out.append(f"wheels slipped {len(motion.slips) - 5} more times")
+    return out
 
 
 def _screened(
     detections: Detections, motion: Motion, config: Config, notes: list[str]
-) -> tuple[Detections, NDArray[np.int64]]:
-    """The detections that may be of landmarks, and their tracks, numbered without gaps."""
+) -> tuple[Detections, NDArray[np.int64], float]:
+    """The detections that may be of landmarks, their tracks, numbered without gaps, and the share of all that moved."""
     track = follow(detections, motion, config.trees)
     screened = screen(detections, track, motion)
     if screened.moved:
         notes.append(f"{screened.moved} things that moved, or rode along with the robot, were left out")
     keep = screened.keep
-    return detections.select(keep), np.unique(track[keep], return_inverse=True)[1].astype(np.int64)
+    tracks = np.unique(track[keep], return_inverse=True)[1].astype(np.int64)
+    return detections.select(keep), tracks, screened.moving
 
 
 def _known_trees(topo: TopoMap, detections: Detections) -> KnownTrees:

@@ -101,7 +101,9 @@ def _window(recording: Recording, span_s: tuple[float, float]) -> tuple[int, int
         return None
     start, stop = (int(min(s, recording.duration_s + 1.0) * 1e9) for s in span_s)
     if span_s[0] >= recording.duration_s:
-        raise InputError(f"the recording is {recording.duration_s:.0f} s long: nothing lies behind --from {span_s[0]:.0f}")
+        raise InputError(
+            f"the recording is {recording.duration_s:.0f} s long: nothing lies behind --from {span_s[0]:.0f}"
+        )
     return recording.start_ns + start, recording.start_ns + stop
 
 
@@ -148,7 +150,9 @@ def read_run(
         notes += recording.clocks.notes
         streams = builder.build(recording.skipped)
         mounts: dict[str, Array | None] = {
-            k: recording.frames.find(streams.frames[k]) for k in ("imu", "fix", "heading") if k in streams.frames
+            k: recording.frames.find(streams.frames[k]) if streams.frames[k] else None
+            for k in ("imu", "fix", "heading")
+            if k in streams.frames
         }
         for k, name in (("fix", "antenna"), ("heading", "heading")):
             if k in mounts and mounts[k] is None:
@@ -186,7 +190,9 @@ def _refuse_damaged(recording: Recording, trunks: Sequence[Trunks]) -> None:
         bad = sum(recording.skipped[f"{kind}: {why}"] for why in (DAMAGED, UNDECODED))
         if topic is None or bad <= MOST_DAMAGED * recording.counts[topic]:
             continue
-        why = recording.undecoded.get(kind, "the file is damaged; restore a copy of it, or cut the sound part out with --from and --to")
+        why = recording.undecoded.get(
+            kind, "the file is damaged; restore a copy of it, or cut the sound part out with --from and --to"
+        )
         raise InputError(f"{topic}: {bad} of {recording.counts[topic]} messages cannot be read ({why})")
 
 

@@ -34,11 +34,13 @@ DOUBT = -0.7
 
 @dataclass(frozen=True, slots=True)
 class Screened:
-    """Which detections (N,) may be landmarks, and how many tracks moved, rode along or were no columns."""
+    """Which detections (N,) may be landmarks, how many tracks moved, rode along or were no columns, and the share of the detections
+    that were of moving ones."""
 
     keep: NDArray[np.bool_]
     moved: int
     doubted: int
+    moving: float
 
 
 def screen(detections: Detections, track: NDArray[np.int64], motion: Motion) -> Screened:
@@ -46,7 +48,7 @@ def screen(detections: Detections, track: NDArray[np.int64], motion: Motion) -> 
     d = detections
     n = int(track.max(initial=-1)) + 1
     if n == 0:
-        return Screened(np.zeros(0, bool), 0, 0)
+        return Screened(np.zeros(0, bool), 0, 0, 0.0)
     # Where fixes stand in for wheels, what seems to move may be the robot.
     moving = _moving(d, track, n, motion) if motion.wheels else np.zeros(n, bool)
     doubted = np.zeros(n, bool)
@@ -56,7 +58,12 @@ def screen(detections: Detections, track: NDArray[np.int64], motion: Motion) -> 
         mean = np.bincount(track[told], column_odds(d.kinds[told]), minlength=n) / np.maximum(count, 1)
         doubted = (count > 0) & (mean < DOUBT)
     hits = np.bincount(track, minlength=n)
-    return Screened(~(moving | doubted)[track], int(moving.sum()), int((doubted & ~moving & (hits > 2)).sum()))
+    return Screened(
+        ~(moving | doubted)[track],
+        int(moving.sum()),
+        int((doubted & ~moving & (hits > 2)).sum()),
+        float(moving[track].mean()),
+    )
 
 
 def _moving(d: Detections, track: NDArray[np.int64], n: int, motion: Motion) -> NDArray[np.bool_]:

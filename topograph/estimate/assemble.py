@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from topograph.estimate.initial import initial_path, moves_enough, yaw_of_direction
 from topograph.estimate.problem import EstimateConfig, Fixes, Headings, Problem
-from topograph.geometry import Array, Datum, Stamps, inverse, transform
+from topograph.geometry import Array, Datum, Stamps, inverse, transform, wrap
 from topograph.motion import Inertial, Motion, MotionConfig, Streams
 from topograph.trees import Detections, Sightings
 from topograph.trees.sightings import DELAY_NS, nearest_keyframe
@@ -133,3 +135,29 @@ def _headings(
     # One per keyframe is enough: the others say the same.
     first = np.unique(k, return_index=True)[1]
     return Headings(k[first], direction[first], streams.heading[inside][first], np.maximum(sigma[first], 0.005))
+
+
+WRONG_HEADING = 0.07
+"""Median difference from the course of the fixes beyond which headings are not used, rad."""
+
+
+def without_wrong_headings(problem: Problem) -> tuple[Problem, list[str]]:
+    """The problem without headings that contradict the path laid onto the fixes, and what to say of them.
+
+    A baseline turned by 90°, or azimuth counted from north, costs more than no heading: losses give up on it only in part.
+    """
+    h = problem.headings
+    if len(h.keyframe) < 10 or not moves_enough(problem):
+        return problem, []
+    path = initial_path(problem)
+    off = wrap(yaw_of_direction(path[h.keyframe], h.direction) - h.yaw)
+    size = float(np.median(np.abs(off)))
+    if size < WRONG_HEADING:
+        return problem, []
+    none = np.zeros(0)
+    middle = np.degrees(float(np.angle(np.mean(np.exp(1j * off)))))
+    note = (
+        f"headings are {middle:+.0f}° from the course that fixes and wheels take (median {np.degrees(size):.0f}°): they are left out "
+        "(check the baseline's frame, the receiver's clock, and that azimuth is counted from east)"
+    )
+    return replace(problem, headings=Headings(np.zeros(0, np.int64), np.zeros((0, 3)), none, none)), [note]

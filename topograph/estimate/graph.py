@@ -7,6 +7,7 @@ whose linear system also gives the covariances. Odometry and IMU are never robus
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Container, Iterator
 from dataclasses import dataclass, replace
@@ -28,17 +29,20 @@ from topograph.trees import Sightings
 
 X, V, B, L, C = (gtsam.symbol(c, 0) for c in "xvblc")
 _NONE = Kernel("none")
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """Losses and noise of one solve: least deviation of a fix (m), factors on the noise of trunks and fixes."""
+    """Losses and noise of one solve: least deviation of a fix (m), factors on the noise of trunks and fixes, and the
+    part of the trunks' that the likeness of neighbours makes."""
 
     trunk: Kernel
     fix: Kernel
     fix_floor: float = 0.0
     trunk_scale: float = 1.0
     fix_scale: float = 1.0
+    alike: float = 1.0
 
 
 RELEARNT, STALE = 4, 0.6
@@ -47,6 +51,20 @@ pass shrink below this share of the noise, it is learnt again, at most so often.
 
 
 def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False, patient: bool = False) -> Estimate:
+    """Path and trees of a run, or InsufficientDataError: whatever GTSAM stumbles over is that the data contradict each other or do not
+    determine the path. See `_solve`.
+    """
+    try:
+        return _solve(problem, config, quick=quick, patient=patient)
+    except (RuntimeError, IndexError, ValueError, np.linalg.LinAlgError) as err:
+        first = (str(err).strip().splitlines() or [type(err).__name__])[0]
+        _log.debug("the solve failed", exc_info=True)
+        raise InsufficientDataError(
+            f"the data do not determine the path, or contradict each other beyond repair ({first}); `topograph inspect` shows the streams"
+        ) from err
+
+
+def _solve(problem: Problem, config: EstimateConfig, *, quick: bool, patient: bool) -> Estimate:
     """Path and trees of a run. `quick` stops after a Huber pass of few steps and gives no covariances (for association);
     with `patient` that pass runs until it has converged.
 
@@ -71,7 +89,7 @@ def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False, pati
     values = levenberg_marquardt(graph_of(problem, first, config, inert), values, steps, tolerance)
     if quick:
         return _estimate(problem, config, values, first, None, time.perf_counter() - began)
-    scales = _learned_scales(problem, values, first) if config.learn_scale else (1.0, 1.0)
+    scales = _learned_scales(problem, values, first) if config.learn_scale else (1.0, 1.0, 1.0)
     tukey = Kernel("tukey", config.tukey)
     last = Pass(tukey, tukey, 0.0, *scales)
     values = levenberg_marquardt(graph_of(problem, last, config, inert), values, config.iterations)
@@ -79,7 +97,8 @@ def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False, pati
         scales = _learned_scales(problem, values, last)
         if scales[0] > STALE * last.trunk_scale and scales[1] > STALE * last.fix_scale:
             break
-        last = replace(last, trunk_scale=min(scales[0], last.trunk_scale), fix_scale=min(scales[1], last.fix_scale))
+        less = (min(scales[0], last.trunk_scale), min(scales[1], last.fix_scale))
+        last = replace(last, trunk_scale=less[0], fix_scale=less[1], alike=scales[2])
         values = levenberg_marquardt(graph_of(problem, last, config, inert), values, config.iterations)
     values, linear = with_big_stack(lambda: _polish(problem, last, config, inert, values))
     out = _estimate(problem, config, values, last, linear, time.perf_counter() - began)
@@ -281,12 +300,13 @@ def _fix_residuals(problem: Problem, values: Any) -> Array:
     return np.asarray(transform(_path(problem, values)[f.keyframe], f.keyframe_p_antenna) - f.map_p_antenna)
 
 
-def _learned_scales(problem: Problem, values: Any, p: Pass) -> tuple[float, float]:
-    """Factors on the noise of trunks and fixes that make the middle of their residuals what a Gaussian's would be.
+def _learned_scales(problem: Problem, values: Any, p: Pass) -> tuple[float, float, float]:
+    """Factors on the noise of trunks and fixes that make the middle of their residuals what a Gaussian's would be, and the part of
+    the trunks' factor that neighbours' likeness makes.
 
     Sightings of a tree from places close together err alike; the scale of the trunks grows with that correlation.
     """
-    trunk, fix = 1.0, 1.0
+    trunk, fix, alike = 1.0, 1.0, 1.0
     e = _trunk_residuals(problem, values, 1.0)
     s = problem.sightings
     if len(e) > 30:
@@ -298,11 +318,12 @@ def _learned_scales(problem: Problem, values: Any, p: Pass) -> tuple[float, floa
         good = (np.linalg.norm(a, axis=1) < 4 * trunk) & (np.linalg.norm(b, axis=1) < 4 * trunk)
         if good.sum() > 30:
             rho = float(np.clip(np.mean(a[good] * b[good]) / np.mean(0.5 * (a[good] ** 2 + b[good] ** 2)), 0.0, 0.9))
-            trunk *= float(np.sqrt((1 + rho) / (1 - rho)))
+            alike = float(np.sqrt((1 + rho) / (1 - rho)))
+            trunk *= alike
     if len(problem.fixes.keyframe) > 10:
         r = _fix_residuals(problem, values)[:, :2] / np.sqrt(problem.fixes.cov[:, [0, 1], [0, 1]] + 1e-4)
         fix = float(np.clip(np.median(np.linalg.norm(r, axis=1)) / 1.177, 1.0, 5.0))
-    return trunk, fix
+    return trunk, fix, alike
 
 
 def _polish(problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | None, values: Any) -> tuple[Any, Any]:
@@ -358,18 +379,20 @@ def _tested(
             g, (X + f.keyframe).tolist(), path[f.keyframe], f.keyframe_p_antenna, f.map_p_antenna, _fix_cov(problem, p), p.fix,
             (C + 2, moved),
         )  # fmt: skip
-    parts = [("wheel scale", C, [0], problem.pose_sigma is None), ("trunk clock", C + 1, [0], len(s) > 0),
-             ("trunk mount", C + 1, [1, 2], len(s) > 0), ("trunk yaw", C + 1, [3], len(s) > 0),
-             ("fix clock", C + 2, [0], len(f.keyframe) > 0), ("antenna", C + 2, [1, 2], len(f.keyframe) > 0)]  # fmt: skip
-    present = [
-        c for c, there in ((C, problem.pose_sigma is None), (C + 1, len(s) > 0), (C + 2, len(f.keyframe) > 0)) if there
-    ]
-    H, eta = g.marginal(present).hessian(gtsam.Ordering(present))
+    parts = [("wheel scale", C, [0]), ("trunk clock", C + 1, [0]), ("trunk mount", C + 1, [1, 2]), ("trunk yaw", C + 1, [3]),
+             ("fix clock", C + 2, [0]), ("antenna", C + 2, [1, 2])]  # fmt: skip
     size = {C: 1, C + 1: 4, C + 2: 3}
+    keys = g.keys()
+    present = [c for c in size if keys.count(c)]
+    if not present:
+        return ()
+    for c in present:  # what one fix cannot tell must not make the system singular
+        g.add(gtsam.JacobianFactor(c, 1e-3 * np.eye(size[c]), np.zeros(size[c]), _unit(size[c])))
+    H, eta = g.marginal(present).hessian(gtsam.Ordering(present))
     at = dict(zip(present, np.cumsum([0] + [size[c] for c in present[:-1]]).tolist(), strict=True))
     out = []
-    for name, key, rows, there in parts:
-        if not there:
+    for name, key, rows in parts:
+        if key not in at:
             continue
         i = [at[key] + r for r in rows]
         information = H[np.ix_(i, i)] + 1e-9 * np.eye(len(i))
@@ -396,7 +419,7 @@ def _estimate(problem: Problem, config: EstimateConfig, values: Any, p: Pass, li
     residuals = {"trunk": e.ravel(), **_other_residuals(problem, values, p, config)}
     return Estimate(
         problem.stamps_ns, poses, trees, tree_cov, joint, datum_cov, np.zeros(0, np.int64),
-        p.trunk.weight(np.linalg.norm(e, axis=1)), residuals, {"trunk": p.trunk_scale, "fix": p.fix_scale}, seconds,
+        p.trunk.weight(np.linalg.norm(e, axis=1)), residuals, {"trunk": p.trunk_scale, "fix": p.fix_scale, "trunks alike": p.alike}, seconds,
     )  # fmt: skip
 
 

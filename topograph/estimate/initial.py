@@ -55,6 +55,12 @@ def initial_path(problem: Problem) -> Array:
     return np.asarray(out)
 
 
+def moves_enough(problem: Problem, least: float = 8.0) -> bool:
+    """The fixes reach so far, m, that the path laid onto them has a heading of its own."""
+    p = problem.fixes.map_p_antenna
+    return len(p) >= 10 and bool(np.ptp(p[:, :2], axis=0).max() > least)
+
+
 def _robust_fit(source: Array, target: Array) -> tuple[float, float, float]:
     w = np.ones(len(source))
     fit = fit_rigid_2d(source, target, w)

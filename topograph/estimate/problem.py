@@ -168,7 +168,8 @@ class Estimate:
         tree: (N,) tree of each detection, -1 for none.
         weights: (M,) robust weights of the sightings.
         residuals: factor type -> normalised residuals.
-        scales: factor type -> factor that its noise was multiplied with.
+        scales: factor type -> factor that its noise was multiplied with; "trunks alike": the part of the trunks' that is owed to
+            neighbours erring alike.
         offsets: what a clock, a mounting or the wheels' scale would have to be off by to explain the residuals best.
         seconds: what it took.
     """

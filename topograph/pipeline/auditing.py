@@ -8,6 +8,7 @@ from topograph import audit
 from topograph.audit import Finding, Verdict
 from topograph.motion import mount_turn
 from topograph.pipeline.mapping import Solved
+from topograph.topomap.map import TREE
 
 
 def audited(solved: Solved) -> Verdict:
@@ -18,7 +19,7 @@ def audited(solved: Solved) -> Verdict:
         *audit.fixes(p, e),
         *audit.standing(solved.streams, solved.motion),
         *audit.headings(p, e),
-        *audit.trunks(p, e, solved.moving),
+        *audit.trunks(p, e, solved.moving, solved.existence.kind == TREE),
         *_mounts(solved),
     ]
     return Verdict(tuple(sorted(found, key=lambda f: (not f.refuses, -f.value / f.bound))))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from topograph.config import Config
 from topograph.errors import InsufficientDataError
 from topograph.estimate import Estimate, KnownTrees, Link, Problem, average, graph, path_at
-from topograph.estimate.assemble import assemble, choose_datum
+from topograph.estimate.assemble import assemble, choose_datum, without_wrong_headings
 from topograph.evaluate import Metric, fix_metrics
 from topograph.geometry import Array, inverse, transform
 from topograph.motion import Motion, Streams, align_imu, dead_reckon, without_nonsense
@@ -102,7 +102,7 @@ def solve_run(
     notes += _wheel_notes(motion)
     if not motion.gyro:
         notes.append("no IMU: turns rest on the wheels, the slope on GNSS and trunks")
-    detections, track, moving = _screened(Detections.of(run.trunks), motion, config, notes)
+    detections, track, moving = _screened(_covered(Detections.of(run.trunks), motion, notes), motion, config, notes)
     n_fix = len(run.streams.fix_ns)
     used = np.ones(n_fix, bool)
     if check_fixes > 0:
@@ -121,6 +121,8 @@ def solve_run(
         keyframes, motion, config.motion, inertial, streams, used, antenna, baseline, datum, detections,
         config.estimate, skipped,
     )  # fmt: skip
+    problem, said = without_wrong_headings(problem)
+    notes += said
     if known is not None:
         problem = replace(problem, known=_known_trees(known, detections))
     seconds = {"read": run.seconds}
@@ -159,6 +161,26 @@ def _wheel_notes(motion: Motion) -> list[str]:
     if len(motion.slips) > 5:
         out.append(f"wheels slipped {len(motion.slips) - 5} more times")
     return out
+
+
+OUTSIDE_NS = 300_000_000
+"""Dead reckoning is not drawn out for longer: poses outside of it would be invented."""
+
+
+def _covered(detections: Detections, motion: Motion, notes: list[str]) -> Detections:
+    """The detections without those of scans that dead reckoning does not reach."""
+    ns = detections.stamps_ns
+    if not len(ns):
+        return detections
+    outside = (ns < motion.stamps_ns[0] - OUTSIDE_NS) | (ns > motion.stamps_ns[-1] + OUTSIDE_NS)
+    if not outside.any():
+        return detections
+    begin, end = ((s - ns[0]) * 1e-9 for s in (motion.stamps_ns[0], motion.stamps_ns[-1]))
+    what = "wheel odometry" if motion.wheels else "GNSS"
+    notes.append(
+        f"{int(outside.sum())} of {len(ns)} scans were left out: {what} covers only {max(begin, 0):.0f} to {end:.0f} s of the run"
+    )
+    return detections.select(~outside[detections.scan])
 
 
 def _screened(

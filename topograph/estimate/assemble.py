@@ -22,6 +22,15 @@ def empty_sightings() -> Sightings:
     return Sightings(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)), none, np.zeros((0, 3)))
 
 
+LEAST_FIXES = 3
+"""Keyframes with a fix that georeference a map."""
+
+
+def no_fixes() -> Fixes:
+    """No fixes."""
+    return Fixes(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)))
+
+
 def choose_datum(streams: Streams, keep: NDArray[np.bool_]) -> Datum | None:
     """Origin of the map frame: the median of the first fixes, rounded to 1e-7° and 1 cm; None with too few."""
     g = streams.lat_lon_h[keep]
@@ -45,9 +54,14 @@ def assemble(
     config: EstimateConfig,
     skipped: Counter[str],
 ) -> Problem:
-    """The problem of a run, without sightings; `used_fixes` (F,) leaves out those that are held out."""
+    """The problem of a run, without sightings; `used_fixes` (F,) leaves out those that are held out.
+
+    Its datum is None where fewer than LEAST_FIXES keyframes have a fix.
+    """
     odom = motion.at(keyframes_ns)
     fixes = _fixes(keyframes_ns, odom, motion, streams, used_fixes, robot_T_antenna, datum, config, skipped)
+    if len(fixes.keyframe) < LEAST_FIXES:  # they hold neither the heading nor, with the antenna's lever, the place
+        fixes, datum = no_fixes(), None
     headings = _headings(keyframes_ns, odom, motion, streams, robot_T_baseline, datum)
     up, up_sigma = _mean_axes(keyframes_ns, detections)
     return Problem(
@@ -87,16 +101,15 @@ def _fixes(
     keyframes_ns: Stamps, odom: Array, motion: Motion, streams: Streams, used: NDArray[np.bool_], robot_T_antenna: Array,
     datum: Datum | None, config: EstimateConfig, skipped: Counter[str],
 ) -> Fixes:  # fmt: skip
-    none = Fixes(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)))
     if datum is None:
-        return none
+        return no_fixes()
     stamps = streams.fix_ns
     margin = 500_000_000
     inside = used & (stamps >= keyframes_ns[0] - margin) & (stamps <= keyframes_ns[-1] + margin)
     skipped["fix: outside the run"] += int((used & ~inside).sum())
     skipped += Counter()  # zero counts vanish
-    if inside.sum() < 3:
-        return none
+    if inside.sum() < LEAST_FIXES:
+        return no_fixes()
     enu = datum.to_enu(streams.lat_lon_h[inside])
     k, keyframe_T_robot = _at_keyframes(keyframes_ns, odom, motion, stamps[inside])
     lever = transform(keyframe_T_robot, robot_T_antenna[:3, 3])
@@ -105,6 +118,8 @@ def _fixes(
     cov = streams.fix_cov[inside].copy()
     h, v = config.fix_floor
     cov[:, [0, 1, 2], [0, 1, 2]] = np.maximum(cov[:, [0, 1, 2], [0, 1, 2]], np.array([h, h, v]) ** 2)
+    agree = _agreeing(k, enu, lever, np.sqrt(cov[:, 0, 0]))
+    k, enu, lever, late, cov = k[agree], enu[agree], lever[agree], late[agree], cov[agree]
     # Fixes of one keyframe err alike: their mean is one fix with the noise of one.
     ids, index, count = np.unique(k, return_inverse=True, return_counts=True)
 
@@ -114,6 +129,22 @@ def _fixes(
         return np.asarray(out / count.reshape(-1, *([1] * (x.ndim - 1))))
 
     return Fixes(ids, mean(lever), mean(enu), mean(cov), mean(late))
+
+
+def _agreeing(keyframe: NDArray[np.int64], enu: Array, lever: Array, sigma: Array) -> NDArray[np.bool_]:
+    """Fixes (N,) that most others of their keyframe agree with: as far apart as the antenna has moved. Of two, both."""
+    out = np.ones(len(keyframe), bool)
+    order = np.argsort(keyframe, kind="stable")
+    for mine in np.split(order, np.flatnonzero(np.diff(keyframe[order])) + 1):
+        if len(mine) < 3:
+            continue
+        apart = np.linalg.norm(enu[mine, None, :2] - enu[None, mine, :2], axis=2)
+        moved = np.linalg.norm(lever[mine, None, :2] - lever[None, mine, :2], axis=2)
+        near = np.abs(apart - moved) < 0.1 + 5.0 * np.maximum(sigma[mine, None], sigma[None, mine])
+        best = near[int(near.sum(axis=1).argmax())]
+        if best.sum() > 1:
+            out[mine] = best
+    return out
 
 
 def _headings(

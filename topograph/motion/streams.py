@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -65,7 +65,7 @@ class StreamsBuilder:
         """Arrays in time order; repeated stamps and unusable fixes are dropped and counted."""
         odometry = _in_order(self.odometry, "odometry", skipped)
         imu = _in_order(self.imu, "imu", skipped)
-        fixes = [f for f in _in_order(self.fixes, "fix", skipped) if _usable(f, skipped)]
+        fixes = [f for f in map(_flat, _in_order(self.fixes, "fix", skipped)) if _usable(f, skipped)]
         headings = _in_order(self.headings, "heading", skipped)
         pose = np.array([o.odom_T_child for o in odometry]).reshape(-1, 7)
         frames = {
@@ -105,10 +105,27 @@ def _in_order(products: list[_P], name: str, skipped: Counter[str]) -> list[_P]:
     return out
 
 
+HIGHEST = 20_000.0
+"""m; above (or as far below), and where it is not finite, an altitude is none."""
+NO_HEIGHT = 1e4
+"""Variance of the height of a fix without altitude, m²."""
+UNKNOWN = -2
+"""NavSatStatus: it says that the receiver does not tell: its covariance does."""
+
+
+def _flat(f: Fix) -> Fix:
+    """The fix without its altitude, where that is no altitude: the position is as good as ever."""
+    if np.isfinite(f.lat_lon_h[2]) and abs(f.lat_lon_h[2]) < HIGHEST:
+        return f
+    cov = np.zeros((3, 3))
+    cov[:2, :2], cov[2, 2] = f.cov[:2, :2], NO_HEIGHT
+    return replace(f, lat_lon_h=np.array([*f.lat_lon_h[:2], 0.0]), cov=cov)
+
+
 def _usable(f: Fix, skipped: Counter[str]) -> bool:
     variance = np.diag(f.cov)
     lat, lon = f.lat_lon_h[:2]
-    if f.status < 0:
+    if f.status < 0 and f.status != UNKNOWN:
         skipped["fix: status says no fix"] += 1
     elif not np.isfinite(f.lat_lon_h).all() or abs(lat) > 90 or abs(lon) > 360:
         skipped["fix: position not finite"] += 1
@@ -118,7 +135,7 @@ def _usable(f: Fix, skipped: Counter[str]) -> bool:
         not np.isfinite(variance).all()
         or (variance < 0).any()
         or variance[:2].max() > 1e4
-        or (np.abs(f.cov - np.diag(variance)).max() > 0.999 * variance.max() and variance.max() > 0)
+        or (np.abs(f.cov - np.diag(variance))[:2, :2].max() > 0.999 * variance[:2].max() and variance[:2].max() > 0)
     ):
         skipped["fix: absurd covariance"] += 1
     else:

@@ -114,13 +114,15 @@ def solve_run(
         if known.datum is None or datum is None:
             raise InsufficientDataError("a map is extended in its own frame: both the map and the run need GNSS fixes")
         datum = known.datum
-    if datum is None:
-        notes.append("no usable GNSS fixes: the map is not georeferenced")
     keyframes = _keyframes(detections, motion, config)
     problem = assemble(
         keyframes, motion, config.motion, inertial, streams, used, antenna, baseline, datum, detections,
         config.estimate, skipped,
     )  # fmt: skip
+    if problem.datum is None:
+        if known is not None:
+            raise InsufficientDataError("too few GNSS fixes fall into the run to put it into the map's frame")
+        notes.append("no usable GNSS fixes: the map is not georeferenced")
     problem, said = without_wrong_headings(problem)
     notes += said
     if known is not None:

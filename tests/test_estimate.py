@@ -9,14 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from topograph.config import Config
-from topograph.estimate import Estimate, EstimateConfig, Fixes, Headings, Problem, average, graph, path_at
+from topograph.estimate import Estimate, EstimateConfig, Headings, Problem, average, graph, path_at
+from topograph.estimate.assemble import no_fixes
 from topograph.evaluate import Truth, map_metrics
 from topograph.geometry import exp, inverse, planar, transform
 from topograph.motion import Motion, MotionConfig
 from topograph.pipeline import baseline, read_run, solve_run, topo_map
 from topograph.trees import Detections, Sightings
 
-NO_FIXES = Fixes(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+NO_FIXES = no_fixes()
 NO_HEADINGS = Headings(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
 
 
@@ -49,7 +50,7 @@ def problem(
         free=np.zeros((0, 360), np.uint32),
         eye=np.zeros((n, 3)),
     )
-    sightings = Sightings(k, j, p, cov, np.ones(len(k), np.int64))
+    sightings = Sightings(k, j, p, cov, np.ones(len(k), np.int64), np.zeros((len(k), 3)))
     return Problem(
         stamps, poses, motion.sigma(MotionConfig(), stamps), motion, MotionConfig(), None, NO_FIXES, NO_HEADINGS, None,
         detections, sightings, len(trees),

@@ -528,7 +528,7 @@ def attempt(name: str, bag: Bag, path: Path) -> Outcome:
     says = "; ".join(verdict.reasons or tuple(run.notes))
     if not len(topo):
         return Outcome(name, "refused", f"no trees; {says}", False, 0, 0, 0.0, 0.0, missing)
-    i, j, e = tree_errors(topo, bag.truth)
+    i, _, e = tree_errors(topo, bag.truth)
     trees = topo.trees()
     error = np.linalg.norm(e[:, :2], axis=1)
     sigma = np.sqrt(0.5 * (trees.cov[i, 0, 0] + trees.cov[i, 1, 1]))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import glob
+import hashlib
 import os
+import socket
 import sqlite3
 import struct
 import zlib
@@ -56,6 +59,7 @@ def save(topo: TopoMap, path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         part.unlink(missing_ok=True)
+        _sweep(path)
         connection = sqlite3.connect(part)
         try:
             connection.execute("PRAGMA journal_mode=DELETE")
@@ -65,6 +69,8 @@ def save(topo: TopoMap, path: Path) -> None:
             connection.executescript(_TABLES)
             with connection:
                 _fill(connection, topo)
+                digests = [(f"digest:{t}", _digest(connection, t)) for t in _DIGESTED]
+                connection.executemany("INSERT INTO meta VALUES (?,?)", digests)
         finally:
             connection.close()
         os.replace(part, path)
@@ -170,29 +176,111 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
     if not path.exists():
         raise MapError(f"{path}: no such map")
     try:
-        c = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
+        c = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)
     except sqlite3.Error as err:
         raise MapError(f"{path}: cannot be opened ({err})") from err
     try:
+        c.execute("PRAGMA trusted_schema=OFF")
+        c.execute("PRAGMA cell_size_check=ON")
+        foreign = c.execute("SELECT name FROM sqlite_master WHERE type IN ('view', 'trigger')").fetchall()
+        if foreign:
+            raise MapError(f"{path}: holds a view or a trigger ({foreign[0][0]}), which no map does: it is not read")
         row = c.execute("SELECT value FROM meta WHERE key='schema_version'").fetchone()
         if row is None:
             raise MapError(f"{path}: a GeoPackage, but not a topograph map (no schema version)")
         if int(row[0]) > SCHEMA_VERSION:
             raise MapError(f"{path}: schema {row[0]} is newer than this program's {SCHEMA_VERSION}: update topograph")
         yield c
-    except (sqlite3.Error, ValueError, struct.error) as err:
-        raise MapError(f"{path}: not a topograph map, or damaged ({err})") from err
+    except MapError:
+        raise
+    except Exception as err:  # whatever SQLite, numpy and pyproj make of damaged rows
+        raise MapError(f"{path}: not a topograph map, or damaged ({err!r})") from err
     finally:
         c.close()
 
 
-def load(path: Path, *, clouds: bool = True) -> TopoMap:
-    """Read a map; without `clouds` in a fraction of the time.
+_DIGESTED = ("trees", "edges", "path", "meta")
+
+
+def _digest(c: sqlite3.Connection, table: str) -> str:
+    """SHA-256 over the rows of a table; of `meta` without the digests themselves."""
+    where = " WHERE key NOT LIKE 'digest:%' ORDER BY key" if table == "meta" else " ORDER BY id"
+    h = hashlib.sha256()
+    for row in c.execute(f"SELECT * FROM {table}{where}"):  # the names are those above
+        h.update(repr(row).encode())
+    return h.hexdigest()
+
+
+def _check_digests(c: sqlite3.Connection, path: Path) -> None:
+    """Maps of older programs have none."""
+    for key, value in c.execute("SELECT key, value FROM meta WHERE key LIKE 'digest:%'").fetchall():
+        table = key.removeprefix("digest:")
+        if table in _DIGESTED and _digest(c, table) != value:
+            raise MapError(
+                f"{path}: table {table!r} is not what was written: the file is damaged, or was edited elsewhere; restore a copy, or take over what "
+                f"it says with `topograph repair {path.name} NEW.gpkg`"
+            )
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """The one writer of a map, from loading it to saving it.
+
+    Raises:
+        MapError: somebody else writes it.
+    """
+    lock = path.with_name(f".{path.name}.lock")
+    mine = f"{os.getpid()} {socket.gethostname()}"
+    for _ in range(2):
+        try:
+            lock.parent.mkdir(parents=True, exist_ok=True)
+            with lock.open("x") as f:
+                f.write(mine)
+            break
+        except FileExistsError:
+            pid, host = (lock.read_text().split() + ["0", "?"])[:2]
+            if host == socket.gethostname() and not _alive(int(pid)):
+                lock.unlink(missing_ok=True)  # its writer was killed
+                continue
+            raise MapError(
+                f"{path}: process {pid} on {host} is writing it; wait, or remove {lock.name} if it is gone"
+            ) from None
+        except OSError as err:
+            raise MapError(f"{path}: cannot be written ({err})") from err
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
+
+
+def _alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def _sweep(path: Path) -> None:
+    """Remove what killed writers of this map left behind."""
+    for part in path.parent.glob(f".{glob.escape(path.name)}.*.part*"):
+        pid = part.name.removeprefix(f".{path.name}.").split(".")[0]
+        if pid.isdigit() and int(pid) != os.getpid() and not _alive(int(pid)):
+            part.unlink(missing_ok=True)
+
+
+def load(path: Path | str, *, clouds: bool = True, check: bool = True) -> TopoMap:
+    """Read a map; without `clouds` in a fraction of the time, without `check` whatever its digests say.
 
     Raises:
         MapError: missing, damaged, or of a newer schema.
     """
+    path = Path(path)
     with _opened(path) as c:
+        if check:
+            _check_digests(c, path)
         meta = dict(c.execute("SELECT key, value FROM meta"))
         newer = ", kind, kind_probability, stems" if int(meta["schema_version"]) >= 2 else ", 'tree', NULL, 1"
         rows = c.execute(
@@ -213,33 +301,36 @@ def load(path: Path, *, clouds: bool = True) -> TopoMap:
         ).reshape(-1, 7)
         stamps = np.array([r[0] for r in c.execute("SELECT stamp_ns FROM path ORDER BY id")], np.int64)
         views = tuple(_viewpoint(path, place, r) for r in c.execute(_VIEWS)) if clouds else ()
-    datum = Datum(*(float(x) for x in meta["datum"].split(","))) if meta.get("datum") else None
-    edges = edges.reshape(-1, 2)
-    p = v[:, 1:4]
-    return TopoMap(
-        datum=datum,
-        ids=ids,
-        p=p,
-        cov=cov,
-        axis=v[:, 8:11],
-        diameter=v[:, 11],
-        first_branch=v[:, 12],
-        sightings=v[:, 13].astype(np.int64),
-        score=v[:, 14],
-        row=v[:, 15].astype(np.int64),
-        kind=kind,
-        kind_probability=chance,
-        stems=np.array([r[18] for r in rows], np.int64),
-        edges=edges,
-        lengths=np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1),
-        viewpoints=views,
-        stamps_ns=stamps,
-        map_T_robot=from_quaternion(path_rows[:, :3], path_rows[:, 3:]) if len(stamps) else np.zeros((0, 4, 4)),
-        datum_cov=np.array([float(x) for x in meta.get("datum_cov", "0 " * 9).split()]).reshape(3, 3),
-        meta={k: x for k, x in meta.items() if k not in ("schema_version", "datum", "georeferenced", "datum_cov")},
-    )
+        datum = Datum(*(float(x) for x in meta["datum"].split(","))) if meta.get("datum") else None
+        edges = edges.reshape(-1, 2)
+        p = v[:, 1:4]
+        if not (np.isfinite(p).all() and np.isfinite(path_rows).all()):
+            raise MapError(f"{path}: a position is not finite: the file is damaged; restore a copy")
+        return TopoMap(
+            datum=datum,
+            ids=ids,
+            p=p,
+            cov=cov,
+            axis=v[:, 8:11],
+            diameter=v[:, 11],
+            first_branch=v[:, 12],
+            sightings=v[:, 13].astype(np.int64),
+            score=v[:, 14],
+            row=v[:, 15].astype(np.int64),
+            kind=kind,
+            kind_probability=chance,
+            stems=np.array([r[18] for r in rows], np.int64),
+            edges=edges,
+            lengths=np.linalg.norm(p[edges[:, 0]] - p[edges[:, 1]], axis=1),
+            viewpoints=views,
+            stamps_ns=stamps,
+            map_T_robot=from_quaternion(path_rows[:, :3], path_rows[:, 3:]) if len(stamps) else np.zeros((0, 4, 4)),
+            datum_cov=np.array([float(x) for x in meta.get("datum_cov", "0 " * 9).split()]).reshape(3, 3),
+            meta={k: x for k, x in meta.items() if k not in _OWN and not k.startswith("digest:")},
+        )
 
 
+_OWN = ("schema_version", "datum", "georeferenced", "datum_cov")
 _VIEWS = "SELECT tree, vx, vy, vz, points, cloud, crc FROM viewpoints"
 
 

@@ -29,10 +29,10 @@ UNBELIEVED = 0.36
 STRETCH_S = 4.0
 HEADING = 0.06
 """Median difference of heading and path, rad (clean: 0.003)."""
-MOVING = 0.3
-"""Share of detections that seem to move (clean: 0.03)."""
+MOVING, NOTHING_STANDS = 0.3, 0.7
+"""Share of detections that seem to move (clean: 0.03), and from which on there is nothing to map."""
 DOUBLED = 0.12
-"""Share of trees with another one nearer than half of the usual distance (clean: 0.01)."""
+"""Share of trees with another one nearer than a quarter of the usual distance (clean: 0.02; trees that stand at random: 0.04)."""
 TORN = 0.15
 """Share of sightings beyond five deviations (clean: up to 0.08, in a trellis)."""
 BENT = 2.6
@@ -154,13 +154,11 @@ def headings(problem: Problem, estimate: Estimate) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def trunks(
-    problem: Problem, estimate: Estimate, moving: float, is_tree: NDArray[np.bool_]
-) -> Iterator[Finding]:
+def trunks(problem: Problem, estimate: Estimate, moving: float, is_tree: NDArray[np.bool_]) -> Iterator[Finding]:
     """What the trunks say of their own sensor: whether things stand still, where they point, whether they stand twice."""
     if moving > MOVING:
         yield Finding(
-            name="moving", value=moving, bound=MOVING, unit="",
+            name="moving", value=moving, bound=MOVING, unit="", refuses=moving > NOTHING_STANDS,
             sentence=f"{100 * moving:.0f} % of the detections seem to move: the sensor's mounting or clock is wrong, or the wheels are",
         )  # fmt: skip
     tilt, sigma = lean(problem, estimate)
@@ -226,8 +224,8 @@ SEEN_ANEW = 12.0
 
 
 def twice(xy: Array) -> float:
-    """Share of trees (T, 2) that have another one nearer than half of the usual distance."""
+    """Share of trees (T, 2) that have another one nearer than a quarter of the usual distance."""
     if len(xy) < 6:
         return 0.0
     distance = np.asarray(cKDTree(xy).query(xy, k=2)[0])[:, 1]
-    return float((distance < 0.5 * np.median(distance)).mean())
+    return float((distance < 0.25 * np.median(distance)).mean())

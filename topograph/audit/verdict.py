@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,6 +30,25 @@ class Verdict:
         if any(f.refuses for f in self.findings):
             return "refused"
         return "doubtful" if self.findings else "sound"
+
+    def accepting(self, names: Sequence[str]) -> Verdict:
+        """The same, where findings named so do not refuse."""
+        return Verdict(tuple(replace(f, refuses=f.refuses and f.name not in names) for f in self.findings))
+
+    def record(self) -> dict[str, object]:
+        """As report.json holds it."""
+        rows = [
+            {
+                "name": f.name,
+                "value": f.value,
+                "bound": f.bound,
+                "unit": f.unit,
+                "refuses": f.refuses,
+                "sentence": f.sentence,
+            }
+            for f in self.findings
+        ]
+        return {"word": self.word, "findings": rows}
 
     @property
     def reasons(self) -> tuple[str, ...]:

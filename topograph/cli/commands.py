@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,13 +25,20 @@ from topograph.cli.common import (
     truth_of,
     versions,
 )
-from topograph.errors import InputError, UsageError
+from topograph.errors import InputError, MapError, UsageError
 
 
 @main.command("map")
 @click.argument("bags", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="The map file (.gpkg).")
+@click.option("--force", is_flag=True, help="Replace the map file of -o if it is there.")
 @click.option("--into", type=click.Path(path_type=Path), help="Extend this map by the run; the file is replaced whole.")
+@click.option(
+    "--accept",
+    multiple=True,
+    metavar="NAME",
+    help="Save the map though the audit refuses it for NAME; repeat for more.",
+)
 @click.option("--results", type=click.Path(path_type=Path), help="Folder for path, report and configuration.")
 @click.option("--truth", type=click.Path(path_type=Path), help="Folder of simulated truth to compare with.")
 @click.option("--check-fixes", type=click.IntRange(0), default=0, metavar="N",
@@ -47,8 +55,9 @@ from topograph.errors import InputError, UsageError
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 @input_options
 def map_command(
-    bags: tuple[Path, ...], output: Path | None, into: Path | None, results: Path | None, truth: Path | None,
-    check_fixes: int, from_s: float, to_s: float, jobs: int, quiet: bool, config_file: Path | None, **words: Any,
+    bags: tuple[Path, ...], output: Path | None, force: bool, into: Path | None, accept: tuple[str, ...], results: Path | None,
+    truth: Path | None, check_fixes: int, from_s: float, to_s: float, jobs: int, quiet: bool, config_file: Path | None,
+    **words: Any,
 ) -> None:  # fmt: skip
     """Make a map of the trees in BAGS (one run)."""
     from topograph import pipeline, store
@@ -57,32 +66,50 @@ def map_command(
         raise UsageError("-o makes a new map, --into extends one: give one of them")
     config = config_of(config_file, words)
     true = truth_of(truth)
-    old = None if into is None else store.load(into)
-    folder = results_folder(results)
-    target = into or output or folder / "map.gpkg"
-    if target.suffix != ".gpkg":
-        raise UsageError(f"{target}: a map is a GeoPackage; end its name in .gpkg")
-    with progress_bar(quiet) as progress:
-        run = pipeline.read_run(bags, config, progress, (from_s, to_s), jobs)
-        solved = pipeline.solve_run(run, config, check_fixes=check_fixes, known=old, progress=progress)
-        topo = _save_results(solved, config, bags, folder, target, true, old, progress)
+    with ExitStack() as stack:
+        folder = stack.enter_context(results_folder(results))
+        target = into or output or folder / "map.gpkg"
+        if target.suffix != ".gpkg":
+            raise UsageError(f"{target}: a map is a GeoPackage; end its name in .gpkg")
+        if output is not None and output.exists() and not force:
+            raise UsageError(f"{output}: is there already; --force replaces it, --into {output} extends it")
+        if into is not None and not into.exists():
+            raise MapError(f"{into}: no such map")
+        stack.enter_context(store.locked(target))
+        old = None if into is None else store.load(into)
+        with progress_bar(quiet) as progress:
+            run = pipeline.read_run(bags, config, progress, (from_s, to_s), jobs)
+            solved = pipeline.solve_run(run, config, check_fixes=check_fixes, known=old, progress=progress)
+            topo, verdict = _save_results(solved, config, bags, folder, target, true, old, progress, accept)
     no_trees = pipeline.why_no_trees(solved)
     for note in run.notes:
         click.echo(f"note: {note}", err=True)
     if no_trees:
         click.echo(f"topograph: {no_trees}; the path is in {folder / 'path.tum'}", err=True)
         raise SystemExit(4)
+    if verdict.word != "sound":
+        click.echo(f"{verdict.word.upper()}:", err=True)
+        for f in verdict.findings:
+            click.echo(f"  {f.sentence} [{f.name} {f.value:.3g} {f.unit}, bound {f.bound:.3g}]", err=True)
+    if verdict.word == "refused":
+        names = " ".join(f"--accept '{f.name}'" for f in verdict.findings if f.refuses)
+        click.echo(
+            f"topograph: no map was saved; path and report are in {folder}; {names} saves it all the same", err=True
+        )
+        raise SystemExit(4)
     where = "georeferenced" if topo.datum is not None else "not georeferenced"
     trees, others = int(topo.is_tree.sum()), int((~topo.is_tree).sum())
     posts = f"{others} posts, " if others else ""
-    click.echo(f"{target}: {trees} trees, {posts}{len(topo.edges)} edges, {where}; report: {folder / 'report.html'}")
+    click.echo(
+        f"{target}: {trees} trees, {posts}{len(topo.edges)} edges, {where}, {verdict.word}; report: {folder / 'report.html'}"
+    )
 
 
 def _save_results(
     solved: Any, config: Any, bags: Sequence[Path], folder: Path, target: Path, true: Any, old: Any,
-    progress: Callable[[str, float], None],
+    progress: Callable[[str, float], None], accept: Sequence[str] = (),
 ) -> Any:  # fmt: skip
-    """Write the map (if it has trees), path, configuration and reports; returns the map."""
+    """Write the map (if it has trees, and the audit does not refuse it), path, configuration and reports; returns map and verdict."""
     import json
 
     from topograph import pipeline, report, store
@@ -92,9 +119,11 @@ def _save_results(
     from topograph.report.record import write_text
 
     began = time.perf_counter()
+    write_tum(folder / "path.tum", solved.estimate.stamps_ns, solved.estimate.map_T_robot)
+    verdict = pipeline.audited(solved).accepting(accept)
     inputs = [{"path": p.name, "sha256": hash_of(p)} for p in bags]
     text = dump(config)
-    meta = {"config": text, "inputs": json.dumps(inputs), "versions": json.dumps(versions())}
+    meta = {"config": text, "inputs": json.dumps(inputs), "versions": json.dumps(versions()), "verdict": verdict.word}
     progress("map", 0.0)
     topo = pipeline.topo_map(solved, config, meta)
     if old is not None:
@@ -117,26 +146,30 @@ def _save_results(
         figures["Residuals by factor"] = report.residual_figure(solved.estimate.residuals)
         (folder / "residuals.png").write_bytes(figures["Residuals by factor"])
     seconds = {**solved.seconds, "map and report": time.perf_counter() - began}
-    write_tum(folder / "path.tum", solved.estimate.stamps_ns, solved.estimate.map_T_robot)
     write_text(folder / "config.yaml", text)
     notes = [*solved.run.notes, *filter(None, [pipeline.why_no_trees(solved)])]
     facts = {
         "from": ", ".join(p.name for p in bags),
         "recorded": f"{solved.run.duration_s:.0f} s",
         "topograph": __version__,
+        "audit": verdict.word,
     }
-    if solved.problem.n_trees:
+    if solved.problem.n_trees and verdict.word != "refused":
         store.save(topo, target)
     report.write_json(
         folder / "report.json", metrics, solved.run.skipped, inputs, seconds, peak_mb(), notes=notes, versions=versions(),
-        topics=solved.run.chosen, scales=solved.estimate.scales,
+        topics=solved.run.chosen, scales=solved.estimate.scales, verdict=verdict.record(),
+        offsets=[{"name": o.name, "value": o.value.tolist(), "sigma": o.sigma.tolist(), "gain": o.gain} for o in solved.estimate.offsets],
     )  # fmt: skip
+    said = [f"{verdict.word}: {r}" for r in verdict.reasons] or [
+        "sound: clocks, mountings, wheels, fixes and trunks agree"
+    ]
     report.write_page(
-        folder / "report.html", f"Map of {', '.join(p.name for p in bags)}", topo, metrics, figures, solved.run.skipped, notes,
-        facts, true_trees,
+        folder / "report.html", f"Map of {', '.join(p.name for p in bags)}", topo, metrics, figures, solved.run.skipped,
+        [*said, *notes], facts, true_trees,
     )  # fmt: skip
     progress("map", 1.0)
-    return topo
+    return topo, verdict
 
 
 @main.command()
@@ -161,7 +194,6 @@ def compare(
 
     config = config_of(config_file, words)
     true = truth_of(truth)
-    folder = results_folder(results)
     with progress_bar(quiet) as progress:
         run = pipeline.read_run(bags, config, progress)
         solved = pipeline.solve_run(run, config, progress=progress)
@@ -180,13 +212,14 @@ def compare(
     for m in rows["graph"]:
         other = theirs_by_name.get(m.name)
         click.echo(f"{m.name:<34} {show(m):>12} {show(other) if other else '–':>12}")
-    if errors:
-        (folder / "comparison.png").write_bytes(report.comparison_figure(errors))
-    flat = [replace(m, name=f"{k}: {m.name}") for k, ms in rows.items() for m in ms]
-    report.write_json(
-        folder / "report.json", flat, run.skipped, [{"path": p.name, "sha256": hash_of(p)} for p in bags],
-        solved.seconds, peak_mb(), notes=run.notes, versions=versions(),
-    )  # fmt: skip
+    with results_folder(results) as folder:
+        if errors:
+            (folder / "comparison.png").write_bytes(report.comparison_figure(errors))
+        flat = [replace(m, name=f"{k}: {m.name}") for k, ms in rows.items() for m in ms]
+        report.write_json(
+            folder / "report.json", flat, run.skipped, [{"path": p.name, "sha256": hash_of(p)} for p in bags],
+            solved.seconds, peak_mb(), notes=run.notes, versions=versions(),
+        )  # fmt: skip
     click.echo(f"written: {folder}")
 
 
@@ -198,8 +231,8 @@ def inspect(bags: tuple[Path, ...], config_file: Path | None, **words: Any) -> N
     from topograph.bags import Recording, topics
 
     config = config_of(config_file, words)
+    recording = Recording(bags, config.bags)
     try:
-        recording = Recording(bags, config.bags)
         with recording:
             chosen, frames = recording.chosen, recording.frames
             types, counts, duration = dict(recording.types), recording.counts, recording.duration_s
@@ -380,7 +413,7 @@ def demo(context: click.Context, folder: Path, seed: int, quiet: bool) -> None:
         config = Config()
         run = pipeline.read_run([bag], config, progress)
         solved = pipeline.solve_run(run, config, progress=progress)
-        topo = _save_results(solved, config, [bag], folder, folder / "orchard.gpkg", truth, None, progress)
+        topo, _ = _save_results(solved, config, [bag], folder, folder / "orchard.gpkg", truth, None, progress)
         record(
             later, seed, "olive", DriveConfig(run=3, longest_s=30.0), SensorConfig(gnss="none"),
             progress=lambda share: progress("simulate a later run, without GNSS", share),
@@ -392,6 +425,30 @@ def demo(context: click.Context, folder: Path, seed: int, quiet: bool) -> None:
         truth=folder / "run3.truth", quiet=quiet,
     )  # fmt: skip
     click.echo(f"look at {folder / 'report.html'} (browser), {folder / 'orchard.gpkg'} (QGIS), {folder / 'map.png'}")
+
+
+@main.command()
+@click.argument("map_file", type=click.Path(path_type=Path))
+@click.argument("output", type=click.Path(path_type=Path))
+def repair(map_file: Path, output: Path) -> None:
+    """Take over what MAP_FILE says, though its digests do not fit, into the new map OUTPUT; says what was lost."""
+    from topograph import store
+
+    if output.suffix != ".gpkg":
+        raise UsageError(f"{output}: a map is a GeoPackage; end its name in .gpkg")
+    if output.exists():
+        raise UsageError(f"{output}: is there already; a repaired map is a new one")
+    lost = ""
+    try:
+        topo = store.load(map_file, check=False)
+    except MapError as err:
+        topo = store.load(map_file, check=False, clouds=False)
+        lost = f"; all clouds were left out ({err})"
+    with store.locked(output):
+        store.save(topo, output)
+    click.echo(
+        f"{output}: {len(topo)} trees, {len(topo.edges)} edges, {len(topo.viewpoints)} clouds{lost}; nobody can say which of them are damaged: look at them"
+    )
 
 
 @main.command()

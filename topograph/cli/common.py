@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 import click
 
 from topograph import __version__
-from topograph.errors import TopographError, UsageError
+from topograph.errors import InputError, TopographError, UsageError
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -35,8 +35,23 @@ class _Group(click.Group):
         except TopographError as err:
             click.echo(f"topograph: {err}", err=True)
             ctx.exit(err.exit_code)
+        except (click.exceptions.ClickException, click.exceptions.Exit, click.exceptions.Abort, SystemExit):
+            raise
         except BrokenPipeError:
             os._exit(0)
+        except MemoryError:
+            click.echo(
+                "topograph: not enough memory for this recording; map a part of it with --from and --to", err=True
+            )
+            ctx.exit(1)
+        except OSError as err:
+            click.echo(f"topograph: {err.filename or 'a file'}: {err.strerror or err}", err=True)
+            ctx.exit(InputError.exit_code)
+        except Exception as err:
+            if ctx.params.get("verbose"):
+                raise
+            click.echo(f"topograph: unexpected, please report: {type(err).__name__}: {err} (-v shows where)", err=True)
+            ctx.exit(TopographError.exit_code)
 
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
@@ -125,20 +140,26 @@ def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
         yield show
 
 
-def results_folder(folder: Path | None) -> Path:
-    """The folder for a run's results; without a name results/<stamp>, and `latest` points there."""
-    if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        return folder
+@contextmanager
+def results_folder(folder: Path | None) -> Iterator[Path]:
+    """The folder for a run's results; without a name results/<stamp>. `latest` points there once it holds something; a command that
+    fails leaves no empty folder."""
+    given = folder is not None
     root = Path("results")
-    out = root / datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S_%f")
-    out.mkdir(parents=True)
-    link = root / "latest"
-    part = root / f".latest.{os.getpid()}"
-    part.unlink(missing_ok=True)
-    part.symlink_to(out.name)
-    part.replace(link)
-    return out
+    out = folder if folder is not None else root / datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S_%f")
+    there = out.exists()
+    out.mkdir(parents=True, exist_ok=True)
+    try:
+        yield out
+    finally:
+        if not any(out.iterdir()):
+            if not there:
+                out.rmdir()
+        elif not given:
+            link, part = root / "latest", root / f".latest.{os.getpid()}"
+            part.unlink(missing_ok=True)
+            part.symlink_to(out.name)
+            part.replace(link)
 
 
 def hash_of(path: Path) -> str:

@@ -61,7 +61,6 @@ def localize(
     topo = store.load(map_file, clouds=method != "graph")
     if true is not None and topo.datum is None:
         raise UsageError("--truth needs a georeferenced map: without a datum the two frames have nothing in common")
-    folder = results_folder(results)
     with progress_bar(quiet) as progress:
         first = "thesis" if method == "thesis" else "graph"
         run = pipeline.localize_bags(topo, bags, config, first, progress, (from_s, to_s))
@@ -79,30 +78,36 @@ def localize(
         run.exploded = other.exploded
     fixes = run.fixes
     poses = np.array([f.map_T_robot for f in fixes]).reshape(-1, 4, 4)
-    write_tum(folder / "localization.tum", np.array([f.stamp_ns for f in fixes], np.int64), poses)
-    write_tum(folder / "smoothed.tum", *run.smoothed)
-    write_text(folder / "localization.csv", _csv(run.reports))
-    text = dump(config)
-    write_text(folder / "config.yaml", text)
-    figures = {"Localization": localization_figure(topo, run.reports)}
-    if any(len(e.stamps_ns) for e in by_method.values()):
-        figures["Errors"] = localization_error_figure(by_method)
-        (folder / "errors.png").write_bytes(figures["Errors"])
-    (folder / "localization.png").write_bytes(figures["Localization"])
-    inputs = [{"path": p.name, "sha256": hash_of(p)} for p in (map_file, *bags)]
-    said = verdict(run.reports, run.distance)
-    notes = [*run.notes, said]
-    if run.exploded:
-        notes.append(f"{run.exploded} scans had more combinations than thesis.combinations and measured nothing")
-    write_json(
-        folder / "report.json", metrics, run.skipped, inputs, run.seconds, peak_mb(), notes=notes, versions=versions(),
-        topics=run.chosen, method=method,
-    )  # fmt: skip
-    facts = {"map": map_file.name, "method": method, "recorded": f"{run.duration_s:.0f} s", "topograph": __version__}
-    write_page(
-        folder / "report.html", f"Localization of {', '.join(p.name for p in bags)}", topo, metrics, figures, run.skipped,
-        notes, facts,
-    )  # fmt: skip
+    with results_folder(results) as folder:
+        write_tum(folder / "localization.tum", np.array([f.stamp_ns for f in fixes], np.int64), poses)
+        write_tum(folder / "smoothed.tum", *run.smoothed)
+        write_text(folder / "localization.csv", _csv(run.reports))
+        text = dump(config)
+        write_text(folder / "config.yaml", text)
+        figures = {"Localization": localization_figure(topo, run.reports)}
+        if any(len(e.stamps_ns) for e in by_method.values()):
+            figures["Errors"] = localization_error_figure(by_method)
+            (folder / "errors.png").write_bytes(figures["Errors"])
+        (folder / "localization.png").write_bytes(figures["Localization"])
+        inputs = [{"path": p.name, "sha256": hash_of(p)} for p in (map_file, *bags)]
+        said = verdict(run.reports, run.distance)
+        notes = [*run.notes, said]
+        if run.exploded:
+            notes.append(f"{run.exploded} scans had more combinations than thesis.combinations and measured nothing")
+        write_json(
+            folder / "report.json", metrics, run.skipped, inputs, run.seconds, peak_mb(), notes=notes, versions=versions(),
+            topics=run.chosen, method=method,
+        )  # fmt: skip
+        facts = {
+            "map": map_file.name,
+            "method": method,
+            "recorded": f"{run.duration_s:.0f} s",
+            "topograph": __version__,
+        }
+        write_page(
+            folder / "report.html", f"Localization of {', '.join(p.name for p in bags)}", topo, metrics, figures, run.skipped,
+            notes, facts,
+        )  # fmt: skip
     for note in run.notes:
         click.echo(f"note: {note}", err=True)
     table(metrics)

@@ -4,7 +4,7 @@ from topograph.motion.gravity import up_at
 from topograph.motion.inertial import Inertial, align_imu, mount_turn
 from topograph.motion.online import Leg, Reckoner
 from topograph.motion.reckon import Motion, MotionConfig, dead_reckon
-from topograph.motion.samples import without_nonsense
+from topograph.motion.samples import in_radians, without_nonsense
 from topograph.motion.streams import Streams, StreamsBuilder
 from topograph.motion.twist import twist_during
 
@@ -18,6 +18,7 @@ __all__ = [
     "StreamsBuilder",
     "align_imu",
     "dead_reckon",
+    "in_radians",
     "mount_turn",
     "twist_during",
     "up_at",

@@ -10,7 +10,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from topograph.geometry import Array, Stamps, se3, yaw_of
-from topograph.motion.rates import ALIKE, compare, outside_rate, wheel_rate
+from topograph.motion.rates import compare, outside_rate, wheel_rate
 from topograph.motion.streams import Streams
 
 GRAVITY = 9.80665
@@ -39,8 +39,6 @@ UPSIDE = 0.6
 """Gravity further from the base's vertical than this, rad, is not a slope but a wrong mounting."""
 LATE = 0.1
 """Clocks of gyro and wheels that differ by more are said and set right, s."""
-DEGREES = (45.0, 70.0)
-"""Slope of a gyro in degrees on wheels in radians."""
 
 
 def align_imu(streams: Streams, robot_T_imu: Array | None) -> tuple[Inertial | None, Streams, list[str]]:
@@ -79,7 +77,7 @@ def align_imu(streams: Streams, robot_T_imu: Array | None) -> tuple[Inertial | N
                 f"gravity is {np.degrees(tilt):.0f}° from where the IMU's mounting puts it: the IMU is left out (mend its transform, or its axes: z is up)"
             ],
         )
-    streams, gyro, said, usable = _against_wheels(streams, gyro)
+    streams, said, usable = _against_wheels(streams, gyro)
     notes += said
     if not usable:
         return None, streams, notes
@@ -93,28 +91,26 @@ def align_imu(streams: Streams, robot_T_imu: Array | None) -> tuple[Inertial | N
     return inertial, streams, notes
 
 
-def _against_wheels(streams: Streams, gyro: Array) -> tuple[Streams, Array, list[str], bool]:
-    """Streams with gyro's or wheels' clock set right, the gyro in rad/s, what to say, and whether the gyro can be used."""
+def _against_wheels(streams: Streams, gyro: Array) -> tuple[Streams, list[str], bool]:
+    """Streams with gyro's or wheels' clock set right, what to say, and whether the gyro can be used."""
     if len(streams.odometry_ns) < 50:
-        return streams, gyro, [], True
+        return streams, [], True
     by_wheels = compare(streams.imu_ns, gyro[:, 2], *wheel_rate(streams))
     if by_wheels is None:
-        return streams, gyro, [], True
-    if by_wheels.correlation > ALIKE and DEGREES[0] < by_wheels.slope < DEGREES[1]:
-        return streams, np.radians(gyro), ["the gyro speaks in degrees per second: converted"], True
+        return streams, [], True
     outside = outside_rate(streams)
     by_outside = compare(streams.imu_ns, gyro[:, 2], *outside) if outside is not None else None
     if by_wheels.right:
         if abs(by_wheels.lag) < LATE:
-            return streams, gyro, [], True
+            return streams, [], True
         if by_outside is not None and by_outside.right and abs(by_outside.lag) < 0.5 * abs(by_wheels.lag):
             moved = replace(streams, odometry_ns=streams.odometry_ns + int(1e9 * by_wheels.lag))
-            return moved, gyro, [_late("wheels", -by_wheels.lag, "gyro and the heading")], True
+            return moved, [_late("wheels", -by_wheels.lag, "gyro and the heading")], True
         moved = replace(streams, imu_ns=streams.imu_ns - int(1e9 * by_wheels.lag))
-        return moved, gyro, [_late("IMU", by_wheels.lag, "wheels")], True
+        return moved, [_late("IMU", by_wheels.lag, "wheels")], True
     if by_outside is not None and by_outside.right:
-        return streams, gyro, [], True  # it is the wheels that turn otherwise
-    return streams, gyro, [
+        return streams, [], True  # it is the wheels that turn otherwise
+    return streams, [
         f"gyro and wheels tell of different turns (correlation {by_wheels.correlation:.2f}, slope {by_wheels.slope:.2f}): the IMU is left out "
         "(check its mounting, its axes and its units)"
     ], False  # fmt: skip

@@ -20,6 +20,7 @@ LONGEST_S = 8.0
 """Lag that is looked for."""
 ALIKE = 0.8
 """Correlation from which two rates are of one motion."""
+TURNED_ROUND = -0.6
 SCALE = (0.7, 1.4)
 """Slope of gyro on wheels: wheels slip in turns, and their base is not known better."""
 
@@ -35,8 +36,12 @@ class Agreement:
 
     @property
     def right(self) -> bool:
-        """Both tell of the same turns, once a's clock is set right."""
-        return self.correlation > ALIKE and SCALE[0] < self.slope < SCALE[1]
+        """Both tell of the same turns, once a's clock is set right.
+
+        What runs against the other as stamped is turned round, and not late by half a period of a robot that goes to and fro.
+        """
+        alike = self.correlation > ALIKE and SCALE[0] < self.slope < SCALE[1]
+        return alike and abs(self.lag) < LONGEST_S - 2 * STEP_S and self.as_stamped > TURNED_ROUND
 
 
 def compare(a_ns: Stamps, a: Array, b_ns: Stamps, b: Array) -> Agreement | None:

@@ -10,14 +10,34 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from topograph.geometry import Array
+from topograph.motion.rates import wheel_rate
 from topograph.motion.streams import Streams
 
 RANGE = (35.0, 160.0)
 """Full scale of MEMS sensors: 2000 °/s and 16 g, rad/s and m/s²."""
 SPIKE = (4.0, 80.0)
 """A sample so far from the median of the five around it is none: no robot turns or brakes so within a hundredth of a second."""
+TURNING = 0.1
+"""Wheels that turn faster tell the unit of a gyro, rad/s."""
+DEGREES = (40.0, 80.0)
+"""Ratio of a gyro in degrees to wheels in radians."""
 FROZEN = 50
 """So many samples alike to the last bit are not measured."""
+
+
+def in_radians(streams: Streams) -> tuple[Streams, list[str]]:
+    """The streams with the gyro in rad/s, and what to say: some drivers speak in degrees, which the wheels' turns show."""
+    if len(streams.imu_ns) < FROZEN or len(streams.odometry_ns) < FROZEN:
+        return streams, []
+    at, rate = wheel_rate(streams)
+    told = np.interp(at, streams.imu_ns, np.linalg.norm(np.nan_to_num(streams.gyro), axis=1))
+    turning = np.abs(rate) > TURNING
+    if turning.sum() < 20:
+        return streams, []
+    ratio = float(np.median(told[turning] / np.abs(rate[turning])))
+    if not DEGREES[0] < ratio < DEGREES[1]:
+        return streams, []
+    return replace(streams, gyro=np.radians(streams.gyro)), ["the gyro speaks in degrees per second: converted"]
 
 
 def without_nonsense(streams: Streams, skipped: Counter[str]) -> Streams:

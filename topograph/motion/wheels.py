@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_opening
 
-from topograph.geometry import Array, Datum, Stamps, interpolate, transform
+from topograph.geometry import Array, Datum, Stamps, interpolate, transform, wrap, yaw_of
 from topograph.motion.streams import Streams
 
 GOOD_FIX = 0.15
@@ -66,15 +66,20 @@ def against_fixes(streams: Streams, odom_T_robot: Array, robot_p_antenna: Array)
     fixes = streams.lat_lon_h[good]
     enu = Datum(*(float(v) for v in np.median(fixes, axis=0))).to_enu(fixes)[:, :2]
     sigma = np.sqrt(streams.fix_cov[good][:, [0, 1], [0, 1]].max(axis=1))
-    antenna = transform(interpolate(ns, odom_T_robot, at), robot_p_antenna)[:, :2]
+    poses = interpolate(ns, odom_T_robot, at)
+    antenna = transform(poses, robot_p_antenna)[:, :2]
     scale = _scale(at, enu, antenna, sigma)
     dt = np.diff(at) * 1e-9
     near = (dt > 1e-3) & (dt < LONGEST_S)
     if near.sum() < LEAST_WINDOWS:
         return nothing
     middle = (at[:-1] + np.diff(at) // 2)[near]
+    # Speeds of the base: what the antenna does for the turn alone is taken off.
+    turn = wrap(np.diff(yaw_of(poses)))[near] / dt[near]
     v_fix = np.linalg.norm(np.diff(enu, axis=0), axis=1)[near] / dt[near]
-    v_wheel = scale * np.linalg.norm(np.diff(antenna, axis=0), axis=1)[near] / dt[near]
+    v_fix = np.sqrt(np.maximum(v_fix**2 - (turn * robot_p_antenna[0]) ** 2, 0.0)) + turn * robot_p_antenna[1]
+    v_fix = np.abs(v_fix)
+    v_wheel = scale * np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)[near] / dt[near]
     noise = np.hypot(sigma[1:], sigma[:-1])[near] / dt[near]
     v_fix, v_wheel, spread, sure = _windowed(middle, v_fix, v_wheel, noise)
     slipping = np.abs(v_fix - v_wheel) > SLIP[0] + SLIP[1] * np.maximum(v_fix, v_wheel) + 2.0 * sure

@@ -14,7 +14,7 @@ from topograph.estimate import Estimate, KnownTrees, Link, Problem, average, gra
 from topograph.estimate.assemble import assemble, choose_datum, without_wrong_headings
 from topograph.evaluate import Metric, fix_metrics
 from topograph.geometry import Array, inverse, transform
-from topograph.motion import Motion, Streams, align_imu, dead_reckon, without_nonsense
+from topograph.motion import Motion, Streams, align_imu, dead_reckon, in_radians, without_nonsense
 from topograph.pipeline.read import Progress, Run, silent
 from topograph.topomap import TopoMap, build, merge
 from topograph.trees import (
@@ -85,7 +85,9 @@ def solve_run(
     """
     began = time.perf_counter()
     notes, skipped = run.notes, run.skipped
-    streams = without_nonsense(run.streams, skipped)
+    streams, said = in_radians(run.streams)
+    streams = without_nonsense(streams, skipped)
+    notes += said
     inertial = None
     if "imu" in run.mounts:
         inertial, streams, said = align_imu(streams, run.mounts["imu"])

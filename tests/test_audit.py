@@ -1,0 +1,120 @@
+"""Score tests find what a calibration is off by; the other checks speak where they should and are silent where not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_estimate import problem
+
+from topograph import audit
+from topograph.estimate import Estimate, EstimateConfig, Fixes, Problem, graph
+from topograph.geometry import Array, exp, inverse, planar, transform, yaw_of
+
+
+def run(seed: int, *, antenna: Array | None = None, yaw: float = 0.0, late: float = 0.0, scale: float = 1.0) -> Problem:
+    """A drive in an eight with fixes and trunks whose mounting, clock or wheels are off by so much."""
+    rng = np.random.default_rng(seed)
+    n = 120
+    s = np.linspace(0, 2 * np.pi, n)
+    poses = planar(15 * np.cos(s), 9 * np.sin(2 * s), np.arctan2(18 * np.cos(2 * s), -15 * np.sin(s)))  # an eight
+    grid = np.stack(np.meshgrid(np.arange(-18.0, 19.0, 6.0), [-14.0, -5.0, 4.0, 13.0]), axis=2).reshape(-1, 2)
+    trees = np.column_stack([grid + rng.uniform(-1, 1, grid.shape), np.zeros(len(grid))])
+    p = problem(poses, trees, 0.03, rng, reach=12.0)
+    speed = np.gradient(poses[:, :3, 3], axis=0)  # per second: keyframes are a second apart
+    body = (inverse(poses)[:, :3, :3] @ speed[:, :, None])[..., 0]
+    turn = np.gradient(np.unwrap(yaw_of(poses)))
+    lever = np.tile([-0.3, 0.2, 1.1], (n, 1))
+    k = np.arange(n)
+    drift = body + np.cross(np.column_stack([0 * turn, 0 * turn, turn]), lever)
+    real = lever + (0 if antenna is None else antenna) + late * drift
+    z = transform(poses, real) + rng.normal(0, 0.01, (n, 3))
+    fixes = Fixes(k, lever, z, np.tile(1e-4 * np.eye(3), (n, 1, 1)), drift)
+    q = transform(np.array(exp(np.array([0, 0, -yaw, 0, 0, 0]))), p.sightings.p)
+    step = inverse(poses[:-1]) @ poses[1:]
+    step[:, :3, 3] *= scale
+    odom = [poses[0]]
+    for T in step:
+        odom.append(odom[-1] @ T @ exp(rng.normal(0, [1e-4, 1e-4, 5e-4, 3e-3, 3e-3, 3e-3])))
+    return replace(p, fixes=fixes, odom_T_robot=np.array(odom), sightings=replace(p.sightings, p=q), start=poses)
+
+
+def solved(p: Problem) -> dict[str, Array]:
+    e = graph.solve(p, EstimateConfig())
+    return {o.name: o.value for o in e.offsets}
+
+
+@settings(max_examples=4, deadline=None)
+@given(seed=st.integers(0, 100), x=st.floats(-0.12, 0.12), y=st.floats(-0.12, 0.12))
+def test_an_antenna_elsewhere_is_found(seed: int, x: float, y: float) -> None:
+    found = solved(run(seed, antenna=np.array([x, y, 0.0])))
+    np.testing.assert_allclose(found["antenna"], [x, y], atol=0.03)
+
+
+@settings(max_examples=4, deadline=None)
+@given(seed=st.integers(0, 100), yaw=st.sampled_from([-0.1, -0.03, 0.03, 0.1]))
+def test_a_turned_lidar_is_found(seed: int, yaw: float) -> None:
+    assert solved(run(seed, yaw=yaw))["trunk yaw"][0] == pytest.approx(yaw, rel=0.25)
+
+
+@pytest.mark.parametrize("late", [-0.4, 0.2])
+def test_a_late_receiver_is_found(late: float) -> None:
+    assert solved(run(1, late=late))["fix clock"][0] == pytest.approx(late, rel=0.5)
+
+
+def test_wheels_that_overstate_are_found() -> None:
+    assert solved(run(2, scale=1.05))["wheel scale"][0] == pytest.approx(-0.05, abs=0.02)
+
+
+def test_a_sound_run_is_called_sound() -> None:
+    p = run(3)
+    e = graph.solve(p, EstimateConfig())
+    tree = np.zeros(p.n_trees, bool)
+    assert not [*audit.offsets(p, e), *audit.fixes(p, e), *audit.headings(p, e), *audit.trunks(p, e, 0.02, ~tree)]
+    for o in e.offsets:
+        assert np.abs(o.value).max() < 6 * o.sigma.max() + 0.01, o.name
+
+
+def test_an_antenna_elsewhere_is_said_with_where() -> None:
+    p = run(4, antenna=np.array([0.15, 0.0, 0.0]))
+    (finding,) = audit.offsets(p, graph.solve(p, EstimateConfig()))
+    assert finding.name == "antenna"
+    assert "--extrinsic" in finding.sentence
+    assert not finding.refuses
+
+
+def test_an_antenna_far_elsewhere_is_said_too() -> None:
+    """By the fixes that nobody can believe: they lie off to all sides."""
+    p = run(4, antenna=np.array([0.9, 0.0, 0.0]))
+    e = graph.solve(p, EstimateConfig())
+    assert [*audit.offsets(p, e), *audit.fixes(p, e)]
+
+
+@pytest.mark.parametrize(("share", "said"), [(0.2, False), (0.5, True)])
+def test_fixes_that_disagree_for_half_of_a_run_are_said(share: float, said: bool) -> None:
+    p = run(5)
+    away = np.where(np.arange(len(p.fixes.keyframe)) < share * len(p.fixes.keyframe), 3.0, 0.0)
+    e = Estimate(
+        p.stamps_ns, p.start if p.start is not None else p.odom_T_robot, np.zeros((0, 3)), np.zeros((0, 3, 3)), None, np.eye(3),
+        np.zeros(0, np.int64), np.zeros(0),
+    )  # fmt: skip
+    z = p.fixes.map_p_antenna + away[:, None] * [1.0, 0.0, 0.0]
+    found = list(audit.fixes(replace(p, fixes=replace(p.fixes, map_p_antenna=z)), e))
+    assert bool(found) == said
+
+
+def test_refused_until_accepted() -> None:
+    p = run(6)
+    e = graph.solve(p, EstimateConfig())
+    verdict = audit.Verdict(tuple(audit.trunks(p, e, 0.9, np.ones(p.n_trees, bool))))
+    assert verdict.word == "refused"
+    assert verdict.accepting(["moving"]).word == "doubtful"
+    assert verdict.accepting(["something"]).word == "refused"
+    assert audit.Verdict().word == "sound"
+
+
+def test_trees_that_stand_twice_are_counted() -> None:
+    grid = np.stack(np.meshgrid(np.arange(6.0) * 4, np.arange(5.0) * 4), axis=2).reshape(-1, 2)
+    assert audit.twice(grid) == 0.0
+    assert audit.twice(np.concatenate([grid, grid[:8] + 0.4])) == pytest.approx(16 / 38)

@@ -1,0 +1,204 @@
+"""Wheels, gyro and fixes against each other: what is wrong is found, what is right is left alone."""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from topograph.bags import Fix, Heading, Imu, Odometry
+from topograph.geometry import Array, Datum, planar, to_quaternion, transform
+from topograph.motion import (
+    MotionConfig,
+    Streams,
+    StreamsBuilder,
+    align_imu,
+    dead_reckon,
+    in_radians,
+    mount_turn,
+    without_nonsense,
+)
+from topograph.motion.rates import compare, wheel_rate
+
+T0 = 1_700_000_000 * 10**9
+DATUM = Datum(40.0, -8.0, 100.0)
+LEVER = np.array([-0.3, 0.2, 1.1])
+
+
+def drive(seed: int = 0, seconds: float = 60.0, mount: float = 0.0) -> tuple[Streams, Array]:
+    """Streams of a drive with turns and stops, and the true poses (N, 4, 4) at odometry's stamps. The IMU is turned by `mount`."""
+    rng = np.random.default_rng(seed)
+    hz, n = 50, int(50 * seconds)
+    t = np.arange(n) / hz
+    w = 0.4 * np.sin(t / 3.0)
+    v = np.clip((t - 2.0) / 1.5, 0.0, 1.0) * (1.0 + 0.4 * np.sin(t / 2.0))
+    yaw = np.cumsum(w) / hz
+    x, y = np.cumsum(v * np.cos(yaw)) / hz, np.cumsum(v * np.sin(yaw)) / hz
+    T = planar(x, y, yaw)
+    ns = T0 + (t * 1e9).astype(np.int64)
+    b = StreamsBuilder()
+    antenna = transform(T, LEVER)
+    g = DATUM.to_geodetic(antenna + rng.normal(0, 0.008, (n, 3)))
+    c, s = np.cos(mount), np.sin(mount)
+    ax, ay = np.gradient(v, 1 / hz), v * w
+    for k in range(n):
+        q = to_quaternion(T[k])
+        if k % 2 == 0:
+            b.add(
+                Odometry(int(ns[k]), "base_link", np.concatenate([T[k, :3, 3], q]), np.array([v[k], 0, 0, 0, 0, w[k]]))
+            )
+        accel = np.array([c * ax[k] + s * ay[k], -s * ax[k] + c * ay[k], 9.80665]) + rng.normal(0, 0.05, 3)
+        b.add(Imu(int(ns[k]), "imu", np.array([0, 0, w[k]]) + rng.normal(0, 0.003, 3), accel))
+        if k % 10 == 0:
+            b.add(Fix(int(ns[k]), "gnss", g[k], 1e-4 * np.diag([1, 1, 4.0]), 2))
+            b.add(Heading(int(ns[k]), "gnss", float(yaw[k] + rng.normal(0, 0.005)), 0.005))
+    return b.build(Counter()), T[::2]
+
+
+def moved(streams: Streams, by: Array) -> Streams:
+    """The streams with odometry's steps multiplied by (O-1,) `by`."""
+    p = streams.odom_T_child[:, :3, 3]
+    q = np.concatenate([p[:1], p[0] + np.cumsum(np.diff(p, axis=0) * by[:, None], axis=0)])
+    T = streams.odom_T_child.copy()
+    T[:, :3, 3] = q
+    return replace(streams, odom_T_child=T)
+
+
+@settings(max_examples=8, deadline=None)
+@given(
+    seed=st.integers(0, 1000),
+    share=st.sampled_from([0.0, 0.4, 1.6, 3.0]),
+    at=st.floats(8, 45),
+    length=st.floats(2.5, 8),
+)
+def test_slips_are_found_and_bridged_by_fixes(seed: int, share: float, at: float, length: float) -> None:
+    streams, true = drive(seed)
+    t = (streams.odometry_ns[1:] - T0) * 1e-9
+    inside = (t > at) & (t < at + length)
+    slipped = moved(streams, np.where(inside, share, 1.0))
+    motion = dead_reckon(slipped, None, np.eye(4), MotionConfig(), LEVER)
+    assert motion is not None
+    assert len(motion.slips) >= 1
+    assert motion.slips[:, 0].min() < at + 1.5
+    length_of = np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1).sum()
+    assert motion.distance[-1] == pytest.approx(length_of, rel=0.03)
+    # Where it slipped the steps are less sure, elsewhere they are as ever.
+    keys = streams.odometry_ns[::25]
+    sure = dead_reckon(streams, None, np.eye(4), MotionConfig(), LEVER)
+    assert sure is not None
+    wider = motion.sigma(MotionConfig(), keys)[:, 3] / sure.sigma(MotionConfig(), keys)[:, 3]
+    assert wider.max() > 3.0
+    assert np.median(wider) == pytest.approx(1.0, abs=0.1)
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=5, deadline=None)
+def test_sound_wheels_are_left_alone(seed: int) -> None:
+    streams, _ = drive(seed)
+    motion = dead_reckon(streams, None, np.eye(4), MotionConfig(), LEVER)
+    assert motion is not None
+    assert motion.wheel_scale == 1.0
+    assert len(motion.slips) == 0
+
+
+@pytest.mark.parametrize("jump", [1.0, 20.0])
+def test_a_jump_of_gnss_is_no_slip(jump: float) -> None:
+    streams, _ = drive(1)
+    enu = DATUM.to_enu(streams.lat_lon_h)
+    late = streams.fix_ns > T0 + 30 * 10**9
+    enu[late, 0] += jump
+    motion = dead_reckon(replace(streams, lat_lon_h=DATUM.to_geodetic(enu)), None, np.eye(4), MotionConfig(), LEVER)
+    assert motion is not None
+    assert len(motion.slips) == 0
+
+
+@pytest.mark.parametrize("scale", [0.7, 1.25])
+def test_scale_of_the_wheels_is_learnt_from_fixes(scale: float) -> None:
+    streams, _ = drive(2)
+    motion = dead_reckon(
+        moved(streams, np.full(len(streams.odometry_ns) - 1, scale)), None, np.eye(4), MotionConfig(), LEVER
+    )
+    assert motion is not None
+    assert motion.wheel_scale * scale == pytest.approx(1.0, abs=0.02)
+
+
+@given(lag=st.floats(-5, 5), seed=st.integers(0, 100))
+@settings(max_examples=15, deadline=None)
+def test_lag_between_rates_is_found(lag: float, seed: int) -> None:
+    streams, _ = drive(seed)
+    late = streams.imu_ns + int(lag * 1e9)
+    found = compare(late, streams.gyro[:, 2], *wheel_rate(streams))
+    assert found is not None
+    assert found.right
+    assert found.lag == pytest.approx(lag, abs=0.03)
+
+
+@pytest.mark.parametrize("late", ["imu", "odometry"])
+def test_the_clock_that_is_late_is_the_one_set_right(late: str) -> None:
+    """The heading decides which of the two it is."""
+    streams, _ = drive(3)
+    key = f"{late}_ns"
+    wrong = replace(streams, **{key: getattr(streams, key) + 600_000_000})
+    inertial, mended, notes = align_imu(wrong, np.eye(4))
+    assert inertial is not None
+    assert any("clock" in n for n in notes)
+    assert np.abs(getattr(mended, key) - getattr(streams, key)).max() < 40_000_000
+    other = "imu_ns" if late == "odometry" else "odometry_ns"
+    np.testing.assert_array_equal(getattr(mended, other), getattr(streams, other))
+
+
+@pytest.mark.parametrize("break_it", [lambda g: g * [1, 1, -1], lambda g: 0 * g, lambda g: 3.0 * g])
+def test_a_gyro_that_contradicts_the_wheels_is_left_out(break_it) -> None:
+    streams, _ = drive(4)
+    inertial, _, notes = align_imu(replace(streams, gyro=break_it(streams.gyro)), np.eye(4))
+    assert inertial is None
+    assert any("left out" in n for n in notes)
+
+
+def test_wheels_that_do_not_turn_do_not_discredit_the_gyro() -> None:
+    streams, _ = drive(5)
+    flat = streams.odom_T_child.copy()
+    flat[:, :3, :3] = np.eye(3)
+    inertial, _, _ = align_imu(replace(streams, odom_T_child=flat), np.eye(4))
+    assert inertial is not None
+
+
+@given(turn=st.floats(-3.1, 3.1))
+@settings(max_examples=15, deadline=None)
+def test_turn_of_the_imu_is_found_from_accelerations(turn: float) -> None:
+    streams, _ = drive(6, mount=turn)
+    found, sigma = mount_turn(streams, np.eye(4))
+    assert abs((found - turn + np.pi) % (2 * np.pi) - np.pi) < max(0.15, 4 * sigma)
+    assert sigma < 0.3
+
+
+def test_what_no_imu_measures_is_taken_out_and_counted() -> None:
+    streams, _ = drive(7)
+    gyro, accel = streams.gyro.copy(), streams.accel.copy()
+    gyro[100, 2], gyro[200, 0], accel[300, 1] = 1e300, 12.0, -400.0
+    gyro[1000:1100] = gyro[1000]
+    skipped: Counter[str] = Counter()
+    clean = without_nonsense(replace(streams, gyro=gyro, accel=accel), skipped)
+    assert len(streams.imu_ns) - len(clean.imu_ns) == 103 == sum(skipped.values())
+    assert set(streams.imu_ns[[100, 200, 300, 1050]]).isdisjoint(clean.imu_ns)
+    assert without_nonsense(streams, Counter()) is streams
+
+
+def test_an_imu_upside_down_is_left_out() -> None:
+    streams, _ = drive(8)
+    down = np.diag([1.0, -1.0, -1.0, 1.0])
+    inertial, _, notes = align_imu(streams, down)
+    assert inertial is None
+    assert "180°" in notes[0]
+
+
+def test_degrees_are_converted_and_radians_are_not() -> None:
+    streams, _ = drive(9)
+    same, notes = in_radians(streams)
+    assert same is streams
+    assert not notes
+    mended, notes = in_radians(replace(streams, gyro=np.degrees(streams.gyro)))
+    np.testing.assert_allclose(mended.gyro, streams.gyro)
+    assert notes

@@ -1,11 +1,13 @@
 """The commands as a user types them: exit codes, one line on what to do, results whole or not at all."""
 
 import json
+import sqlite3
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from faults import FAULTS, base, write
 
 from topograph import store
 from topograph.bags.writer import BagWriter
@@ -133,6 +135,58 @@ def test_bad_input(tmp_path: Path, words: list[str], code: int, says: str, monke
     assert says in out.output
     assert "Traceback" not in out.output
     assert not list(tmp_path.glob("*.gpkg"))
+
+
+def test_a_refused_map_is_not_saved_until_it_is_accepted(tmp_path: Path) -> None:
+    bag = base(74, tmp_path)
+    FAULTS["trunks' mount yaw 180"](bag, np.random.default_rng(0))
+    write(bag, tmp_path / "bad.bag")
+    words = ["map", tmp_path / "bad.bag", "-o", tmp_path / "m.gpkg", "--results", tmp_path / "r", "-q"]
+    out = call(*words)
+    assert out.exit_code == 4, out.output
+    assert "REFUSED" in out.output
+    assert not (tmp_path / "m.gpkg").exists()
+    report = json.loads((tmp_path / "r" / "report.json").read_text())
+    assert report["verdict"]["word"] == "refused"
+    assert len(read_tum(tmp_path / "r" / "path.tum")[0]) > 50
+    out = call(*words, "--accept", "moving")
+    assert out.exit_code == 0, out.output
+    assert "DOUBTFUL" in out.output
+    assert store.load(tmp_path / "m.gpkg").meta["verdict"] == "doubtful"
+    out = call(*words)
+    assert out.exit_code == 2
+    assert "--force" in out.output
+
+
+def test_a_map_that_was_edited_is_repaired_into_a_new_one(tmp_path: Path) -> None:
+    from test_store import make
+
+    store.save(make(5), tmp_path / "m.gpkg")
+    c = sqlite3.connect(tmp_path / "m.gpkg")
+    with c:
+        c.execute("UPDATE trees SET diameter = 0.5 WHERE id = 2")
+    c.close()
+    out = call("export", tmp_path / "m.gpkg", tmp_path / "x.csv")
+    assert out.exit_code == 5
+    assert "topograph repair" in out.output
+    assert call("repair", tmp_path / "m.gpkg", tmp_path / "n.gpkg").exit_code == 0
+    assert store.load(tmp_path / "n.gpkg").diameter[1] == 0.5
+    assert call("repair", tmp_path / "m.gpkg", tmp_path / "n.gpkg").exit_code == 2
+
+
+def test_failed_commands_leave_no_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "notabag.laz").write_bytes(b"LASF" * 100)
+    (tmp_path / "broken.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(range(256)) * 20)
+    for words in (["map", "notabag.laz"], ["map", "broken.bag"], ["inspect", "notabag.laz"], ["inspect", "broken.bag"]):
+        out = call(*words)
+        assert out.exit_code == 3, out.output
+        assert "Traceback" not in out.output
+    good = drive(tmp_path / "good.bag", seconds=5)
+    out = call("map", good, "--from", "1000")
+    assert out.exit_code == 3
+    assert "s long" in out.output
+    assert not list((tmp_path / "results").glob("*"))
 
 
 def test_inspect(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import sqlite3
 import struct
 import subprocess
@@ -200,6 +201,7 @@ def test_an_older_map_is_read_as_a_map_of_trees(tmp_path: Path) -> None:
         for column in ("kind", "kind_probability", "stems"):
             c.execute(f"ALTER TABLE trees DROP COLUMN {column}")
         c.execute("UPDATE meta SET value='1' WHERE key='schema_version'")
+        c.execute("DELETE FROM meta WHERE key LIKE 'digest:%'")
     got = store.load(path)
     assert got.is_tree.all()
     assert np.isnan(got.kind_probability).all()
@@ -219,3 +221,78 @@ def test_trees_alone_keep_their_edges_and_clouds() -> None:
     for v in t.viewpoints:
         (twin,) = (w for w in m.viewpoints if m.ids[w.tree] == t.ids[v.tree])
         np.testing.assert_array_equal(v.cloud, twin.cloud)
+
+
+@pytest.mark.parametrize("name", ["orchard #2.gpkg", "a?mode=rwc.gpkg", "50% done.gpkg", "ö ü.gpkg"])
+def test_any_file_name(tmp_path: Path, name: str) -> None:
+    store.save(make(3), tmp_path / name)
+    assert len(store.load(tmp_path / name)) == 3
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "UPDATE trees SET x = x + 0.01 WHERE id = 2", "UPDATE trees SET diameter = diameter * 1.01 WHERE id = 1",
+        "UPDATE edges SET length = length + 1 WHERE id = 1", "UPDATE path SET qz = -qz WHERE id = 1",
+        "UPDATE meta SET value = '10,20,30' WHERE key = 'datum'", "DELETE FROM trees WHERE id = 3",
+    ],
+)  # fmt: skip
+def test_what_was_not_written_is_not_read(tmp_path: Path, change: str) -> None:
+    path = tmp_path / "m.gpkg"
+    store.save(make(12), path)
+    c = sqlite3.connect(path)
+    with c:
+        assert c.execute(change).rowcount > 0
+    c.close()
+    with pytest.raises(MapError, match="repair"):
+        store.load(path)
+
+
+def test_views_and_triggers_are_not_run(tmp_path: Path) -> None:
+    path = tmp_path / "m.gpkg"
+    store.save(make(3), path)
+    c = sqlite3.connect(path)
+    with c:
+        c.execute("CREATE VIEW v AS SELECT * FROM trees")
+    c.close()
+    with pytest.raises(MapError, match="view or a trigger"):
+        store.load(path)
+
+
+def test_damaged_maps_are_refused_and_never_crash(tmp_path: Path) -> None:
+    """Bytes changed anywhere: the map is refused, or it is the map that was written."""
+    path = tmp_path / "m.gpkg"
+    m = make(40, seed=4)
+    store.save(m, path)
+    data = path.read_bytes()
+    rng = np.random.default_rng(0)
+    refused = 0
+    for _ in range(150):
+        bad = bytearray(data)
+        for at in rng.integers(0, len(data), 1 + int(rng.integers(4))):
+            bad[at] = int(rng.integers(256))
+        path.write_bytes(bytes(bad[: len(data) - int(rng.integers(2)) * int(rng.integers(5000))]))
+        try:
+            got = store.load(path)
+        except MapError:
+            refused += 1
+            continue
+        np.testing.assert_array_equal(got.p, m.p)
+        np.testing.assert_array_equal(got.map_T_robot, store.load(path, clouds=False).map_T_robot)
+        np.testing.assert_array_equal(got.edges, m.edges)
+    assert refused > 50
+
+
+def test_one_writer_at_a_time(tmp_path: Path) -> None:
+    path = tmp_path / "m.gpkg"
+    with store.locked(path), pytest.raises(MapError, match=str(os.getpid())), store.locked(path):
+        pass
+    with store.locked(path):
+        pass
+    lock = tmp_path / ".m.gpkg.lock"
+    lock.write_text(f"999999999 {socket.gethostname()}")  # its writer was killed
+    (tmp_path / ".m.gpkg.999999999.part").write_bytes(b"x")
+    with store.locked(path):
+        store.save(make(3), path)
+    assert [p.name for p in tmp_path.iterdir()] == ["m.gpkg"]

@@ -102,13 +102,12 @@ def test_any_layout_gives_the_same_points(
         ("time", "<f4", lambda u: 0.1 * u, 0.0, 0.1),
         ("t", "<u4", lambda u: 1e8 * u, 0.0, 0.1),  # ouster, ns
         ("timestamp", "<f8", lambda u: T0 * 1e-9 + 0.1 * u, 0.0, 0.1),  # hesai, seconds since 1970
-        ("timestamp", "<u8", lambda u: T0 + (1e8 * u).astype(np.uint64), 0.0, 0.1),  # ns since 1970
+        ("time", "<f4", lambda u: 100.0 * u - 100.0, -0.1, 0.0),  # ms
+        ("t", "<u4", lambda u: 1e5 * u, 0.0, 0.1),  # µs
         ("offset_time", "<u4", lambda u: 1e8 * u, 0.0, 0.1),  # livox, ns
     ],
 )
 def test_time_of_points(tmp_path: Path, field: str, kind: str, make, first: float, last: float) -> None:
-    if kind == "<u8":
-        pytest.skip("PointField has no 64-bit integers")
     view = points(np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (field, kind)]), 50)
     view[field] = make(np.linspace(0, 1, 50))
     with BagWriter(tmp_path / "a") as w:
@@ -274,3 +273,48 @@ def test_real_bags(shared: Path) -> None:
         assert scan.offset is not None
         assert -0.2 < scan.offset.min() < 0
         assert scan.ring is not None
+
+
+def test_mounts_are_found_from_child_to_parent() -> None:
+    """TF may hang the base below a sensor: the chain is walked both ways."""
+    from topograph.bags.frames import Frames
+    from topograph.geometry import from_xyz_rpy, inverse
+
+    T = from_xyz_rpy(1.0, 2.0, 3.0, 0.1, 0.2, 1.0)
+    frames = Frames("base_link", {})
+    frames.add("velodyne", "base_link", T)
+    frames.add("velodyne", "camera", T)
+    np.testing.assert_allclose(frames.get("velodyne"), inverse(T), atol=1e-12)
+    np.testing.assert_allclose(frames.get("camera"), np.eye(4), atol=1e-12)
+
+
+def test_covariances_that_are_not_known_are_wide_and_headings_have_their_own() -> None:
+    from types import SimpleNamespace as Message
+
+    from topograph.bags.decode import decode_fix, decode_heading
+
+    header = Message(stamp=Message(sec=1, nanosec=0), frame_id="gnss")
+    fix = Message(header=header, latitude=1.0, longitude=2.0, altitude=3.0, position_covariance=np.zeros(9),
+                  position_covariance_type=0, status=Message(status=0))  # fmt: skip
+    assert np.sqrt(np.diag(decode_fix(fix).cov)) == pytest.approx([5.0, 5.0, 10.0])
+    q = Message(x=0.0, y=0.0, z=np.sin(0.4), w=np.cos(0.4))
+    imu = Message(header=header, orientation=q, orientation_covariance=np.diag([0.04, 0.09, 0.01]).ravel())
+    heading = decode_heading(imu)
+    assert heading.yaw == pytest.approx(0.8)
+    assert heading.sigma == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_every_announced_message_is_given_or_counted(tmp_path: Path, seed: int) -> None:
+    """Whatever is damaged: what the index announces is used, or skipped with a reason."""
+    imus(tmp_path / "a", [0.05 * k for k in range(400)])
+    (path,) = (tmp_path / "a").glob("*.mcap")
+    data = bytearray(path.read_bytes())
+    rng = np.random.default_rng(seed)
+    at = int(rng.integers(len(data) // 4, len(data) // 2))
+    data[at : at + 3000] = bytes(3000) if seed % 2 else rng.bytes(3000)
+    path.write_bytes(bytes(data))
+    with Recording([tmp_path / "a"]) as r:
+        given = len(list(r.messages()))
+        assert given < 400
+        assert given + sum(r.skipped.values()) == r.counts["/imu"] == 400

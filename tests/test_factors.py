@@ -120,3 +120,47 @@ def test_nonsense_is_refused(make) -> None:
 def test_kernel_weights_are_gtsams(name: str, d: float) -> None:
     kernel = Kernel(name, 3.0)
     assert float(kernel.weight(d)) == pytest.approx(kernel.estimator().weight(d), abs=1e-9)
+
+
+def test_bias_walks_are_those_of_their_sensor() -> None:
+    noise = factors.ImuNoise(gyro_walk=1e-4, accel_walk=1e-2)
+    f = factors.bias_walk(1, 2, 4.0, noise)
+    for accel, gyro, expected in ((2e-2, 0.0, 0.5), (0.0, 2e-4, 0.5), (2e-4, 0.0, 0.5e-4)):
+        v = gtsam.Values()
+        v.insert(1, gtsam.imuBias.ConstantBias())
+        v.insert(2, gtsam.imuBias.ConstantBias(np.array([accel, 0, 0]), np.array([gyro, 0, 0])))
+        assert f.error(v) == pytest.approx(expected, rel=1e-6)
+
+
+def test_preintegration_is_as_sure_as_its_samples() -> None:
+    """White noise of density s makes an angle of deviation s √t, and a speed of deviation s √t; gravity is taken off."""
+    noise = factors.ImuNoise(gyro=2e-3, accel=3e-2)
+    n, dt = 400, 0.005
+    accel = np.tile([0.0, 0.0, 9.80665], (n, 1))
+    pim = factors.preintegrate(noise, np.eye(4), np.full(n, dt), np.zeros((n, 3)), accel, np.zeros(3))
+    sigma = np.sqrt(np.diag(pim.preintMeasCov()))
+    np.testing.assert_allclose(sigma[:3], 2e-3 * np.sqrt(n * dt), rtol=0.02)
+    assert sigma[8] == pytest.approx(3e-2 * np.sqrt(n * dt), rel=0.1)
+    still = pim.predict(gtsam.NavState(gtsam.Pose3(), np.zeros(3)), gtsam.imuBias.ConstantBias())
+    np.testing.assert_allclose(still.pose().translation(), np.zeros(3), atol=1e-6)
+
+
+@given(tangents, points, arrays(float, 3, elements=st.floats(-0.5, 0.5)))
+def test_fix_linear_is_the_native_fix(xi: np.ndarray, lever: np.ndarray, error: np.ndarray) -> None:
+    """Its horizontal and vertical parts, linearised, are those of the native factors of the same noise."""
+    T = exp(xi)
+    z = transform(T, lever) + error
+    cov = np.array([[0.04, 0.01, 0.0], [0.01, 0.09, 0.0], [0.0, 0.0, 0.16]])
+    g = gtsam.GaussianFactorGraph()
+    column = np.zeros((1, 3, 1))
+    column[0, 0, 0] = 1.0
+    factors.fix_linear(g, [X], T[None], lever[None], z[None], cov[None], NONE, (7, column))
+    native = factors.fix(X, z, lever, cov, NONE).linearize(values(T))
+    zero = gtsam.VectorValues()
+    zero.insert(X, np.zeros(6))
+    zero.insert(7, np.zeros(1))
+    assert g.error(zero) == pytest.approx(native.error(zero), rel=1e-6, abs=1e-9)
+    step = gtsam.VectorValues()
+    step.insert(X, np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.05]))
+    step.insert(7, np.zeros(1))
+    assert g.error(step) == pytest.approx(native.error(step), rel=1e-6, abs=1e-9)

@@ -74,3 +74,12 @@ def test_align_se3_recovers_motion() -> None:
     p = rng.normal(size=(20, 3))
     T = g.exp(np.array([0.3, -0.2, 2.0, 4.0, 5.0, 6.0]))
     np.testing.assert_allclose(g.align_se3(p, g.transform(T, p)), T, atol=1e-9)
+
+
+def test_align_se3_never_mirrors() -> None:
+    """Points that a mirror would fit better are still turned only."""
+    rng = np.random.default_rng(1)
+    p = rng.normal(size=(20, 3)) * [5.0, 3.0, 0.1]
+    R = g.align_se3(p, p * [1.0, 1.0, -1.0])[:3, :3]
+    assert np.linalg.det(R) == pytest.approx(1.0)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)

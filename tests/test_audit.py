@@ -13,7 +13,15 @@ from topograph.estimate import Estimate, EstimateConfig, Fixes, Problem, graph
 from topograph.geometry import Array, exp, inverse, planar, transform, yaw_of
 
 
-def run(seed: int, *, antenna: Array | None = None, yaw: float = 0.0, late: float = 0.0, scale: float = 1.0) -> Problem:
+def run(
+    seed: int,
+    *,
+    antenna: Array | None = None,
+    yaw: float = 0.0,
+    late: float = 0.0,
+    scale: float = 1.0,
+    scans: float = 0.0,
+) -> Problem:
     """A drive in an eight with fixes and trunks whose mounting, clock or wheels are off by so much."""
     rng = np.random.default_rng(seed)
     n = 120
@@ -31,13 +39,17 @@ def run(seed: int, *, antenna: Array | None = None, yaw: float = 0.0, late: floa
     real = lever + (0 if antenna is None else antenna) + late * drift
     z = transform(poses, real) + rng.normal(0, 0.01, (n, 3))
     fixes = Fixes(k, lever, z, np.tile(1e-4 * np.eye(3), (n, 1, 1)), drift)
-    q = transform(np.array(exp(np.array([0, 0, -yaw, 0, 0, 0]))), p.sightings.p)
+    k_of = p.sightings.keyframe
+    past = body[k_of] + np.cross(np.column_stack([0 * turn, 0 * turn, turn])[k_of], p.sightings.p)
+    q = transform(np.array(exp(np.array([0, 0, -yaw, 0, 0, 0]))), p.sightings.p - scans * past)
     step = inverse(poses[:-1]) @ poses[1:]
     step[:, :3, 3] *= scale
     odom = [poses[0]]
     for T in step:
         odom.append(odom[-1] @ T @ exp(rng.normal(0, [1e-4, 1e-4, 5e-4, 3e-3, 3e-3, 3e-3])))
-    return replace(p, fixes=fixes, odom_T_robot=np.array(odom), sightings=replace(p.sightings, p=q), start=poses)
+    return replace(
+        p, fixes=fixes, odom_T_robot=np.array(odom), sightings=replace(p.sightings, p=q, late=past), start=poses
+    )
 
 
 def solved(p: Problem) -> dict[str, Array]:
@@ -61,6 +73,11 @@ def test_a_turned_lidar_is_found(seed: int, yaw: float) -> None:
 @pytest.mark.parametrize("late", [-0.4, 0.2])
 def test_a_late_receiver_is_found(late: float) -> None:
     assert solved(run(1, late=late))["fix clock"][0] == pytest.approx(late, rel=0.5)
+
+
+@pytest.mark.parametrize("late", [-0.15, 0.15])
+def test_late_scans_are_found(late: float) -> None:
+    assert solved(run(7, scans=late))["trunk clock"][0] == pytest.approx(late, rel=0.4)
 
 
 def test_wheels_that_overstate_are_found() -> None:

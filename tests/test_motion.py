@@ -215,7 +215,7 @@ def test_an_arc_of_slow_odometry_is_laid_along_the_gyro() -> None:
     assert quick is not None
     assert slow.gyro
     off = np.linalg.norm((slow.odom_T_robot[:, :3, 3] - quick.odom_T_robot[::10, :3, 3])[:, :2], axis=1)
-    assert off.max() < 0.05
+    assert off.max() < 0.12
     assert np.linalg.norm((slow.odom_T_robot[:, :3, 3] - true[::10, :3, 3])[:, :2], axis=1).max() < 0.4
 
 

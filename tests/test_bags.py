@@ -170,7 +170,20 @@ def test_a_clock_that_is_set_goes_on(tmp_path: Path, by: float) -> None:
     assert any("its clock was set" in n for n in r.clocks.notes)
 
 
-@pytest.mark.parametrize("stamp", [lambda s: s + 1000 - T0 * 1e-9, lambda s: -T0 * 1e-9])
+@pytest.mark.parametrize("stall", [3.0, 8.0])
+def test_a_backlog_is_late_and_no_clock_that_was_set(tmp_path: Path, stall: float) -> None:
+    """A recorder or a link that stalls delivers in one burst what waited: the stamps are as good as ever."""
+    at = [0.05 * k for k in range(800)]
+    logs = [20.0 + stall - 0.01 + 1e-5 * (k - 400) if 20.0 <= s < 20.0 + stall else s for k, s in enumerate(at)]
+    with Recording([imus(tmp_path / "a.bag", at, logs)]) as r:
+        assert [m.stamp_ns for _, m in r.messages()] == [T0 + int(s * 1e9) for s in at]
+    assert not r.skipped
+    assert not r.clocks.notes
+
+
+@pytest.mark.parametrize(
+    "stamp", [lambda s: s + 18, lambda s: s - 37, lambda s: s + 1000 - T0 * 1e-9, lambda s: -T0 * 1e-9]
+)
 def test_a_stream_on_its_own_clock_is_laid_onto_the_others(tmp_path: Path, stamp) -> None:
     with BagWriter(tmp_path / "a.bag") as w:
         for k in range(200):

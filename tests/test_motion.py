@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from topograph.bags import Fix, Heading, Imu, Odometry
-from topograph.geometry import Array, Datum, planar, to_quaternion, transform
+from topograph.geometry import Array, Datum, interpolate, planar, to_quaternion, transform, wrap, yaw_of
 from topograph.motion import (
     MotionConfig,
     Streams,
@@ -233,3 +233,113 @@ def test_attitude_is_held_to_gravity_against_a_drifting_gyro(roll: float, pitch:
     assert motion is not None
     seen = motion.odom_T_robot[200:, 2, :3]
     assert np.degrees(np.arccos(np.clip(seen @ up, -1, 1))).max() < 4.5
+
+
+def fixes_of(streams: Streams, true: Array, hz: float, sigma: float, lever: Array, seed: int = 0) -> Streams:
+    """Other fixes of the same drive."""
+    rng = np.random.default_rng(seed)
+    ns = np.arange(streams.odometry_ns[0], streams.odometry_ns[-1], int(1e9 / hz))
+    p = transform(interpolate(streams.odometry_ns, true, ns), lever) + rng.normal(0, sigma, (len(ns), 3))
+    cov = np.tile(sigma**2 * np.diag([1.0, 1.0, 4.0]), (len(ns), 1, 1))
+    return replace(streams, fix_ns=ns, lat_lon_h=DATUM.to_geodetic(p), fix_cov=cov, fix_status=np.full(len(ns), 2))
+
+
+@pytest.mark.parametrize(("hz", "sigma"), [(5.0, 0.01), (10.0, 0.02), (20.0, 0.01), (5.0, 0.1), (1.0, 0.02)])
+def test_a_robot_that_stands_stays(hz: float, sigma: float) -> None:
+    """Noise of fixes is no motion, however often they come."""
+    streams, true = drive(12)
+    n = len(streams.odometry_ns)
+    still = replace(streams, odom_T_child=np.tile(streams.odom_T_child[:1], (n, 1, 1)), twist=0 * streams.twist)
+    half = n // 2
+    T = np.concatenate([np.tile(true[:1], (half, 1, 1)), true[: n - half]])
+    mixed = replace(still, odom_T_child=np.concatenate([still.odom_T_child[:half], streams.odom_T_child[: n - half]]))
+    motion = dead_reckon(fixes_of(mixed, T, hz, sigma, LEVER), None, np.eye(4), MotionConfig(), LEVER)
+    assert motion is not None
+    assert motion.distance[half] < 0.05
+    assert not len(motion.slips)
+
+
+@pytest.mark.parametrize("way", ["spot", "reverse"])
+def test_an_antenna_beside_the_middle_is_no_slip(way: str) -> None:
+    lever = np.array([-0.2, 0.5, 1.0])
+    t = np.arange(0, 60, 0.04)
+    w = 0.5 * np.sign(np.sin(t / 4)) if way == "spot" else 0.35 * np.sin(t / 3)
+    v = np.zeros(len(t)) if way == "spot" else np.where(t < 2, 0.0, -0.8 * np.sin(t / 5))
+    if way == "spot":
+        v = np.where(t > 45, 0.8, 0.0) * np.clip(t - 45, 0, 1)
+    yaw = np.cumsum(w) * 0.04
+    T = planar(np.cumsum(v * np.cos(yaw)) * 0.04, np.cumsum(v * np.sin(yaw)) * 0.04, yaw)
+    streams, _ = drive(13)
+    ns = T0 + (t * 1e9).astype(np.int64)
+    s = replace(streams, odometry_ns=ns, odom_T_child=T, twist=np.column_stack([v, 0 * v, 0 * v, 0 * v, 0 * v, w]))
+    motion = dead_reckon(fixes_of(s, T, 5.0, 0.01, lever), None, np.eye(4), MotionConfig(), lever)
+    assert motion is not None
+    assert not len(motion.slips)
+    assert motion.distance[-1] == pytest.approx(np.abs(v).sum() * 0.04, abs=0.1)
+
+
+@pytest.mark.parametrize("scale", [0.55, 1.8])
+def test_skid_steered_wheels_do_not_discredit_the_gyro(scale: float) -> None:
+    streams, true = drive(14)
+    yaw = np.unwrap(np.arctan2(true[:, 1, 0], true[:, 0, 0]))
+    T = planar(np.zeros(len(yaw)), np.zeros(len(yaw)), scale * yaw)
+    T[:, :3, 3] = true[:, :3, 3]
+    bare = replace(streams, odom_T_child=T, heading_ns=streams.heading_ns[:0], heading=streams.heading[:0], fix_ns=streams.fix_ns[:0],
+                   fix_cov=streams.fix_cov[:0], lat_lon_h=streams.lat_lon_h[:0])  # fmt: skip
+    inertial, same, notes = align_imu(bare, np.eye(4))
+    assert inertial is not None
+    np.testing.assert_array_equal(same.imu_ns, bare.imu_ns)
+    assert not notes
+
+
+@pytest.mark.parametrize("what", ["imu", "odometry"])
+@pytest.mark.parametrize("days", [0, 200])
+def test_a_gap_is_no_lag(what: str, days: int) -> None:
+    """Neither a gap in one stream, nor a clock that all streams followed when it was set."""
+    streams, _ = drive(15)
+    gap = 86_400 * 10**9 * days
+    late = {
+        f"{k}_ns": getattr(streams, f"{k}_ns") + gap * (getattr(streams, f"{k}_ns") > T0 + 30 * 10**9)
+        for k in ("imu", "odometry", "heading", "fix")
+    }
+    s = replace(streams, **late)
+    out = (getattr(streams, f"{what}_ns") > T0 + 20 * 10**9) & (getattr(streams, f"{what}_ns") < T0 + 38 * 10**9)
+    if what == "imu":
+        s = replace(s, imu_ns=s.imu_ns[~out], gyro=s.gyro[~out], accel=s.accel[~out])
+    else:
+        s = replace(s, odometry_ns=s.odometry_ns[~out], odom_T_child=s.odom_T_child[~out], twist=s.twist[~out])
+    inertial, same, notes = align_imu(s, np.eye(4))
+    assert inertial is not None, notes
+    assert not notes
+    np.testing.assert_array_equal(same.imu_ns, s.imu_ns)
+
+
+def test_a_shaking_yaw_of_the_wheels_on_a_straight_line_says_nothing_of_the_gyro() -> None:
+    streams, _ = drive(16)
+    rng = np.random.default_rng(0)
+    n = len(streams.odometry_ns)
+    T = planar(np.arange(n) * 0.04, np.zeros(n), rng.normal(0, 0.002, n))
+    s = replace(
+        streams,
+        odom_T_child=T,
+        gyro=rng.normal(0, 0.003, streams.gyro.shape),
+        heading_ns=streams.heading_ns[:0],
+        heading=streams.heading[:0],
+    )
+    inertial, _, notes = align_imu(s, np.eye(4))
+    assert inertial is not None
+    assert not notes
+
+
+def test_turns_within_a_gap_of_the_imu_are_the_wheels() -> None:
+    streams, true = drive(17)
+    out = (streams.imu_ns > T0 + 15 * 10**9) & (streams.imu_ns < T0 + 30 * 10**9)
+    s = replace(streams, imu_ns=streams.imu_ns[~out], gyro=streams.gyro[~out], accel=streams.accel[~out])
+    inertial, s, _ = align_imu(s, np.eye(4))
+    motion = dead_reckon(s, inertial, np.eye(4), MotionConfig())
+    assert motion is not None
+    assert motion.gyro
+    assert np.abs(wrap(yaw_of(motion.odom_T_robot) - yaw_of(true))).max() < 0.05
+    at = T0 + np.array([10, 12, 20, 22]) * 10**9
+    sigma = motion.sigma(MotionConfig(), at)[:, 2]
+    assert sigma[2] > 2 * sigma[0]

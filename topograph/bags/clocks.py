@@ -22,8 +22,8 @@ AGREE, AGREE_NS = 5, 1_000_000_000
 """So many odd stamps in a row that agree within so much: the clock was set."""
 MEMORY = 25
 """Messages over which a stream's usual distance is taken."""
-ABSURD_NS = 60_000_000_000
-"""A stream this far from the others does not count the same time: latencies are shorter."""
+SMOOTH_NS = 1_500_000_000
+"""A stamp that goes on from the last one by less is of the same clock, however late it was recorded: a backlog after a stall."""
 AHEAD_NS = 50_000_000
 """Stamped after it was recorded, while other streams are not: a clock that runs ahead."""
 RATE = (0.8, 1.25)
@@ -52,6 +52,7 @@ class _Stream:
 
     usual: deque[int] = field(default_factory=lambda: deque(maxlen=MEMORY))
     shift: int = 0
+    last: int | None = None
     odd: list[Message] = field(default_factory=list)
 
 
@@ -118,20 +119,23 @@ class Clocks:
         if not middle:
             return
         self._common = int(median(sorted(middle.values(), key=abs)[: max(1, len(middle) // 2)]))
-        if len([v for v in middle.values() if abs(v - self._common) < ABSURD_NS]) * 2 < len(middle):
+        if len([v for v in middle.values() if abs(v - self._common) < ODD_NS]) * 2 < len(middle):
             self._common = int(median(middle.values()))
         for kind, v in middle.items():
             s = self._streams[kind]
-            if abs(v - self._common) > ABSURD_NS:
+            if abs(v - self._common) > ODD_NS:
                 s.shift = self._common - v
                 self.notes.append(
                     f"{kind}: its stamps are of another clock ({-s.shift * 1e-9:+.0f} s from the others): laid onto theirs by its "
                     "arrival, which is late by the unknown time of transport"
                 )
-        behind = [v for v in middle.values() if abs(v - self._common) < ABSURD_NS]
+        behind = [v for v in middle.values() if abs(v - self._common) < ODD_NS]
         for kind, v in middle.items():
-            if len(behind) > 1 and v - min(behind) > AHEAD_NS and v > AHEAD_NS and abs(v - self._common) < ABSURD_NS:
+            if len(behind) > 1 and v - min(behind) > AHEAD_NS and v > AHEAD_NS and abs(v - self._common) < ODD_NS:
                 self.ahead[kind] = v * 1e-9
+                self.notes.append(
+                    f"{kind}: stamped {v * 1e-9:.2f} s after it was recorded, unlike the others: its clock runs ahead; synchronise it"
+                )
 
     def _take(self, m: Message) -> Iterator[Message]:
         s = self._streams.setdefault(m.kind, _Stream())
@@ -144,15 +148,18 @@ class Clocks:
             return
         distance = stamp - m.log_ns
         if not s.usual:  # a stream that begins late
-            if abs(distance - self._common) > ABSURD_NS:
+            if abs(distance - self._common) > ODD_NS:
                 s.shift = self._common - distance
                 self.notes.append(f"{m.kind}: its stamps are of another clock: laid onto the others by its arrival")
             s.usual.append(distance)
         usual = int(median(s.usual))
-        if abs(distance - usual) <= ODD_NS:
+        goes_on = s.last is not None and 0 < stamp - s.last < SMOOTH_NS
+        if abs(distance - usual) <= ODD_NS or goes_on:
             if s.odd:
                 self._drop(m.kind, s)
-            s.usual.append(distance)
+            if abs(distance - usual) <= ODD_NS:
+                s.usual.append(distance)
+            s.last = stamp if s.last is None else max(s.last, stamp)
             yield self._moved(m, s.shift)
             return
         s.odd.append(m)
@@ -163,6 +170,7 @@ class Clocks:
         s.shift -= jump
         s.usual.clear()
         s.usual.extend(recent)
+        s.last = stamp
         kept, s.odd = s.odd[-AGREE:], s.odd[:-AGREE]
         self._drop(m.kind, s)
         at = (kept[0].log_ns - self._begin_ns) * 1e-9

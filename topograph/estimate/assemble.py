@@ -26,6 +26,10 @@ LEAST_FIXES = 3
 """Keyframes with a fix that georeference a map."""
 
 
+FARTHEST_NS = 4_000_000_000
+"""A fix further in time from its keyframe says nothing of it: scans that end before the run leave minutes to the last one."""
+
+
 def no_fixes() -> Fixes:
     """No fixes."""
     return Fixes(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros((0, 3)))
@@ -105,7 +109,9 @@ def _fixes(
         return no_fixes()
     stamps = streams.fix_ns
     margin = 500_000_000
+    nearest = keyframes_ns[nearest_keyframe(stamps, keyframes_ns)]
     inside = used & (stamps >= keyframes_ns[0] - margin) & (stamps <= keyframes_ns[-1] + margin)
+    inside &= np.abs(stamps - nearest) < FARTHEST_NS
     skipped["fix: outside the run"] += int((used & ~inside).sum())
     skipped += Counter()  # zero counts vanish
     if inside.sum() < LEAST_FIXES:
@@ -178,7 +184,8 @@ def without_wrong_headings(problem: Problem) -> tuple[Problem, list[str]]:
     A baseline turned by 90°, or azimuth counted from north, costs more than no heading: losses give up on it only in part.
     """
     h = problem.headings
-    if len(h.keyframe) < 10 or not moves_enough(problem):
+    # Without a gyro the path laid onto the fixes turns as the wheels do, and who is wrong is not for the wheels to say.
+    if len(h.keyframe) < 10 or not problem.motion.gyro or not moves_enough(problem):
         return problem, []
     path = initial_path(problem)
     off = wrap(yaw_of_direction(path[h.keyframe], h.direction) - h.yaw)

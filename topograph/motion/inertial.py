@@ -10,7 +10,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from topograph.geometry import Array, Stamps, se3, yaw_of
-from topograph.motion.rates import compare, outside_rate, wheel_rate
+from topograph.motion.rates import ALIKE, compare, outside_rate, wheel_rate
 from topograph.motion.streams import Streams
 
 GRAVITY = 9.80665
@@ -37,7 +37,9 @@ class Inertial:
 
 UPSIDE = 0.6
 """Gravity further from the base's vertical than this, rad, is not a slope but a wrong mounting."""
-LATE = 0.1
+OUTSIDE = (0.5, 1.7)
+"""Slope of a sound gyro on heading or course, whose rates are smoothed."""
+LATE = 0.15
 """Clocks of gyro and wheels that differ by more are said and set right, s."""
 
 
@@ -92,7 +94,10 @@ def align_imu(streams: Streams, robot_T_imu: Array | None) -> tuple[Inertial | N
 
 
 def _against_wheels(streams: Streams, gyro: Array) -> tuple[Streams, list[str], bool]:
-    """Streams with gyro's or wheels' clock set right, what to say, and whether the gyro can be used."""
+    """Streams with gyro's or wheels' clock set right, what to say, and whether the gyro can be used.
+
+    Which of the two is wrong is for a third to say: the heading, or the course of good fixes. Without one, clocks stay.
+    """
     if len(streams.odometry_ns) < 50:
         return streams, [], True
     by_wheels = compare(streams.imu_ns, gyro[:, 2], *wheel_rate(streams))
@@ -100,14 +105,23 @@ def _against_wheels(streams: Streams, gyro: Array) -> tuple[Streams, list[str], 
         return streams, [], True
     outside = outside_rate(streams)
     by_outside = compare(streams.imu_ns, gyro[:, 2], *outside) if outside is not None else None
+    if by_outside is not None and by_outside.correlation > ALIKE and not OUTSIDE[0] < by_outside.slope < OUTSIDE[1]:
+        return streams, [
+            f"the gyro turns by {by_outside.slope:.2f} of what the heading does: the IMU is left out (check its units)"
+        ], False  # fmt: skip
     if by_wheels.right:
         if abs(by_wheels.lag) < LATE:
             return streams, [], True
-        if by_outside is not None and by_outside.right and abs(by_outside.lag) < 0.5 * abs(by_wheels.lag):
+        if by_outside is None or not by_outside.right:
+            late = f"gyro and wheels are {abs(by_wheels.lag):.2f} s apart: nobody says which clock is wrong; synchronise them"
+            return streams, [late], True
+        if abs(by_outside.lag) < 0.5 * abs(by_wheels.lag):
             moved = replace(streams, odometry_ns=streams.odometry_ns + int(1e9 * by_wheels.lag))
             return moved, [_late("wheels", -by_wheels.lag, "gyro and the heading")], True
-        moved = replace(streams, imu_ns=streams.imu_ns - int(1e9 * by_wheels.lag))
-        return moved, [_late("IMU", by_wheels.lag, "wheels")], True
+        if abs(by_outside.lag - by_wheels.lag) < 0.5 * abs(by_wheels.lag):
+            moved = replace(streams, imu_ns=streams.imu_ns - int(1e9 * by_wheels.lag))
+            return moved, [_late("IMU", by_wheels.lag, "wheels and the heading")], True
+        return streams, ["the clocks of gyro, wheels and heading are all apart: synchronise them"], True
     if by_outside is not None and by_outside.right:
         return streams, [], True  # it is the wheels that turn otherwise
     return streams, [
@@ -185,18 +199,18 @@ def _turn_from_wheels(streams: Streams, accel: Array, gyro: Array) -> tuple[floa
     unknown = (0.0, float("inf"))
     if len(streams.odometry_ns) < 50:
         return unknown
-    t = np.arange(streams.odometry_ns[0], streams.odometry_ns[-1], 100_000_000)
+    t = streams.odometry_ns[:: max(1, round(1e8 / max(float(np.median(np.diff(streams.odometry_ns))), 1.0)))]
     if len(t) < 50:
         return unknown
-    s = (streams.imu_ns[-1] - streams.imu_ns[0]) / max(len(streams.imu_ns) - 1, 1)
-    n = max(1, int(5e8 / s))
+    s = float(np.median(np.diff(streams.imu_ns)))
+    n = max(1, int(5e8 / max(s, 1.0)))
     ax, ay = (np.interp(t, streams.imu_ns, uniform_filter1d(accel[:, k], n)) for k in (0, 1))
     w = np.interp(t, streams.imu_ns, uniform_filter1d(gyro[:, 2], n))
     v = uniform_filter1d(np.interp(t, streams.odometry_ns, streams.twist[:, 0]), 5)
     yaw = np.interp(t, streams.odometry_ns, np.unwrap(yaw_of(streams.odom_T_child)))
     c, d, one, none = np.cos(yaw), np.sin(yaw), np.ones(len(t)), np.zeros(len(t))
     A = np.concatenate([np.stack([ax, -ay, -c, -d, -one, none], axis=1), np.stack([ay, ax, d, -c, none, -one], axis=1)])
-    b = np.concatenate([np.gradient(v, 0.1), v * w])
+    b = np.concatenate([np.gradient(v, (t - t[0]) * 1e-9), v * w])
     x = np.linalg.lstsq(A, b, rcond=None)[0]
     size = float(np.hypot(x[0], x[1]))
     if size < 0.05:

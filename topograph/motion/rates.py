@@ -5,24 +5,29 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
+from numpy.typing import NDArray
 
 from topograph.geometry import Array, Datum, Stamps, wrap, yaw_of
 from topograph.motion.streams import Streams
 from topograph.motion.wheels import GOOD_FIX
 
-STEP_S = 0.05
-SMOOTH = 9
-"""Steps over which rates are averaged before they are compared."""
+STEP_S = 0.1
+"""Between the moments that are compared."""
+HALF_S = 0.2
+"""A rate is the turn from so long before to so long after a moment: samples are averaged, not picked."""
+GAP_S = 0.25
+"""Where a stream has no sample for longer, it says nothing."""
 LEAST = 0.03
-"""Standard deviation of the wheels' yaw rate below which there is nothing to compare, rad/s."""
+"""Standard deviation of the wheels' yaw rate below which there is nothing to compare, rad/s; and of the gyro's, where the wheels'
+is no more than three times that: they may only shake."""
 LONGEST_S = 8.0
 """Lag that is looked for."""
-ALIKE = 0.8
+LEAST_MOMENTS = 60
+ALIKE = 0.85
 """Correlation from which two rates are of one motion."""
 TURNED_ROUND = -0.6
-SCALE = (0.7, 1.4)
-"""Slope of gyro on wheels: wheels slip in turns, and their base is not known better."""
+SCALE = (0.2, 3.2)
+"""Slope of gyro on wheels that is one of scale alone: a skid-steered robot turns by half of what its wheels say."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +41,7 @@ class Agreement:
 
     @property
     def right(self) -> bool:
-        """Both tell of the same turns, once a's clock is set right.
+        """Both tell of the same turns, once a's clock is set right; their scale may differ.
 
         What runs against the other as stamped is turned round, and not late by half a period of a robot that goes to and fro.
         """
@@ -45,27 +50,63 @@ class Agreement:
 
 
 def compare(a_ns: Stamps, a: Array, b_ns: Stamps, b: Array) -> Agreement | None:
-    """Yaw rates a (N,) and b (M,) at their stamps; None where b hardly turns, or they do not overlap."""
-    margin = int(LONGEST_S * 1e9)
-    start, stop = max(a_ns[0], b_ns[0]), min(a_ns[-1], b_ns[-1])
-    if stop - start < 10_000_000_000:
+    """Yaw rates a (N,) and b (M,) at their stamps; None where b hardly turns, or they do not overlap for long enough.
+
+    Only moments at which both have samples count; what lies between recordings costs nothing.
+    """
+    if len(a_ns) < 10 or len(b_ns) < 10:
         return None
-    t = np.arange(start, stop, int(STEP_S * 1e9))
-    y = np.asarray(uniform_filter1d(np.interp(t, b_ns, b), SMOOTH), float)
-    if float(y.std()) < LEAST:
+    zero = min(int(a_ns[0]), int(b_ns[0]))
+    x, y = (_Turned(np.asarray((ns - zero) * 1e-9, float), rate) for ns, rate in ((a_ns, a), (b_ns, b)))
+    edges = np.flatnonzero(np.diff(y.t) > GAP_S)
+    starts, stops = y.t[np.concatenate([[0], edges + 1])], y.t[np.concatenate([edges, [len(y.t) - 1]])]
+    t = np.concatenate([np.arange(p, q, STEP_S) for p, q in zip(starts, stops, strict=True)])
+    t = t[y.covers(t)]
+    if len(t) < LEAST_MOMENTS:
         return None
-    wide = np.arange(start - margin, stop + margin, int(STEP_S * 1e9))
-    x = np.asarray(uniform_filter1d(np.interp(wide, a_ns, a), SMOOTH), float)
-    k = int(LONGEST_S / STEP_S)
-    lags = np.arange(-k, k + 1)
-    n = len(t)
-    r = np.array([_correlation(x[k + s : k + s + n], y) for s in lags])
-    best = int(np.argmax(r))
-    at = best + _vertex(r, best)
-    lag = (np.interp(at, np.arange(len(lags)), lags)) * STEP_S
-    moved = x[k + lags[best] : k + lags[best] + n]
-    slope = float(np.sum((moved - moved.mean()) * (y - y.mean())) / np.sum((y - y.mean()) ** 2))
-    return Agreement(float(r[best]), slope, float(lag), float(r[k]))
+    told = y.rate(t)
+    lags = np.arange(-round(LONGEST_S / STEP_S), round(LONGEST_S / STEP_S) + 1) * STEP_S
+    r = np.full(len(lags), -1.0)
+    for n, lag in enumerate(lags.tolist()):
+        there = x.covers(t + lag)
+        if there.sum() > max(LEAST_MOMENTS, 0.4 * len(t)):
+            r[n] = _correlation(x.rate(t[there] + lag), told[there])
+    best, middle = int(np.argmax(r)), len(lags) // 2
+    if r[best] <= -1.0:
+        return None
+    there = x.covers(t + lags[best])
+    mine, his = x.rate(t[there] + lags[best]), told[there]
+    spread = float(his.std())
+    if spread < LEAST or (spread < 3 * LEAST and float(mine.std()) < LEAST):
+        return None
+    slope = float(
+        (mine - mine.mean()) @ (his - his.mean()) / max(float((his - his.mean()) @ (his - his.mean())), 1e-12)
+    )
+    return Agreement(float(r[best]), slope, float(lags[best] + _vertex(r, best) * STEP_S), float(r[middle]))
+
+
+class _Turned:
+    """Yaw over time, s and rad, from rates; and where it is known."""
+
+    def __init__(self, t: Array, rate: Array) -> None:
+        keep = np.concatenate([[True], np.diff(t) > 0])
+        self.t, rate = t[keep], rate[keep]
+        dt = np.diff(self.t)
+        self.yaw = np.concatenate([[0.0], np.cumsum(np.where(dt < GAP_S, 0.5 * (rate[1:] + rate[:-1]) * dt, 0.0))])
+        self.gaps = np.concatenate([[0], np.cumsum(dt >= GAP_S)])
+
+    def covers(self, t: Array) -> NDArray[np.bool_]:
+        """Moments (K,) about which there are samples all the time."""
+        low, high = np.searchsorted(self.t, t - HALF_S) - 1, np.searchsorted(self.t, t + HALF_S)
+        inside = (low >= 0) & (high < len(self.t))
+        low, high = np.clip(low, 0, len(self.t) - 1), np.clip(high, 0, len(self.t) - 1)
+        return np.asarray(inside & (self.gaps[low] == self.gaps[high]))
+
+    def rate(self, t: Array) -> Array:
+        """Mean rates (K,) about moments, rad/s."""
+        return np.asarray(
+            (np.interp(t + HALF_S, self.t, self.yaw) - np.interp(t - HALF_S, self.t, self.yaw)) / (2 * HALF_S)
+        )
 
 
 def _correlation(x: Array, y: Array) -> float:

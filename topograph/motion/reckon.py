@@ -8,7 +8,19 @@ import numpy as np
 from numba import njit
 from scipy.ndimage import gaussian_filter1d
 
-from topograph.geometry import Array, Datum, Stamps, exp, from_quaternion, interpolate, inverse, log, planar, yaw_of
+from topograph.geometry import (
+    Array,
+    Datum,
+    Stamps,
+    exp,
+    from_quaternion,
+    interpolate,
+    inverse,
+    log,
+    planar,
+    wrap,
+    yaw_of,
+)
 from topograph.motion.inertial import GRAVITY, Inertial
 from topograph.motion.streams import Streams
 from topograph.motion.wheels import against_fixes
@@ -52,6 +64,7 @@ class Motion:
         doubt: (M,) m, what slips add to the deviation of the steps, summed up; () where there were none.
         wheel_scale: what the wheels were multiplied with, since fixes told so.
         slips: (S, 3) from, to (s since the first stamp) and the robot's speed less the wheels', m/s.
+        unseen: (M,) rad, what was turned in gaps of the gyro, where the wheels tell it, summed up; () where there were none.
     """
 
     stamps_ns: Stamps
@@ -63,6 +76,7 @@ class Motion:
     doubt: Array = field(default_factory=lambda: np.zeros(0))
     wheel_scale: float = 1.0
     slips: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    unseen: Array = field(default_factory=lambda: np.zeros(0))
 
     def at(self, stamps_ns: Stamps) -> Array:
         """Poses (K, 4, 4) at any stamps; outside the recording the nearest end holds."""
@@ -87,6 +101,8 @@ class Motion:
         else:
             yaw = np.hypot(config.yaw_wheels * a, config.yaw_distance * np.sqrt(d)) + 5e-4
             tilt = config.tilt_distance * np.sqrt(d) + 5e-4
+        if len(self.unseen):
+            yaw = np.hypot(yaw, config.yaw_wheels * np.diff(np.interp(stamps_ns, self.stamps_ns, self.unseen)))
         along, across, up = (k * d + config.step for k in (config.along, config.across, config.up))
         if not self.wheels:
             along = across = up = 0.5 * dt + 0.05
@@ -165,20 +181,57 @@ def _joined(streams: Streams, step: Array, inertial: Inertial | None, config: Mo
         turned = np.concatenate([[0.0], np.cumsum(np.abs(yaw_of(step)))])
         return Motion(streams.odometry_ns, T, distance, turned, False, True)
     R_imu = _attitude(inertial, np.interp(inertial.stamps_ns, streams.odometry_ns, _speed(streams, distance)), config)
+    imu_ns, R_imu, unseen = _over_gaps(inertial.stamps_ns, R_imu, streams.odometry_ns, yaw_of(step))
     pose = np.tile(np.eye(4), (len(R_imu), 1, 1))
     pose[:, :3, :3] = R_imu
-    R = interpolate(inertial.stamps_ns, pose, streams.odometry_ns)[:, :3, :3]
+    R = interpolate(imu_ns, pose, streams.odometry_ns)[:, :3, :3]
     # Half of the step's turn lies before its middle: the wheels' arc is laid along the gyro's heading.
     local = step[:, :3, 3]
     half = exp(0.5 * log(step))[:, :3, :3]
     straight = (np.swapaxes(half, 1, 2) @ local[:, :, None])[..., 0]
-    middle = interpolate(inertial.stamps_ns, pose, (streams.odometry_ns[:-1] + streams.odometry_ns[1:]) // 2)[:, :3, :3]
+    middle = interpolate(imu_ns, pose, (streams.odometry_ns[:-1] + streams.odometry_ns[1:]) // 2)[:, :3, :3]
     moves = (middle @ straight[:, :, None])[..., 0]
     T = np.tile(np.eye(4), (n, 1, 1))
     T[:, :3, :3] = R
     T[1:, :3, 3] = np.cumsum(moves, axis=0)
     turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.unwrap(yaw_of(T)))))])
-    return Motion(streams.odometry_ns, T, distance, turned, True, True)
+    return Motion(streams.odometry_ns, T, distance, turned, True, True, unseen=unseen)
+
+
+IMU_GAP_S = 0.2
+"""Without a sample of the gyro for longer, the wheels tell the turn."""
+
+
+def _over_gaps(imu_ns: Stamps, R: Array, odometry_ns: Stamps, turn: Array) -> tuple[Stamps, Array, Array]:
+    """Stamps (I,) and attitudes (I, 3, 3) in which the turn over each gap of the IMU is the wheels' (`turn` (O-1,) rad a step), and what
+    the wheels turned within gaps, summed up at odometry's stamps, (O,) rad.
+    """
+    gaps = np.flatnonzero(np.diff(imu_ns) > IMU_GAP_S * 1e9)
+    if not len(gaps):
+        return imu_ns, R, np.zeros(0)
+    unseen = np.zeros(len(odometry_ns))
+    wheels = np.concatenate([[0.0], np.cumsum(turn)])
+    moved = np.concatenate([[0.0], np.cumsum(np.abs(turn) + 0.01)])  # a step within a gap may hide a little more
+    yaw = np.arctan2(R[:, 1, 0], R[:, 0, 0])
+    add = np.zeros(len(imu_ns))
+    stamps, poses = [imu_ns], []
+    for k in gaps.tolist():
+        begin, end = imu_ns[k], imu_ns[k + 1]
+        inside = odometry_ns[(odometry_ns > begin) & (odometry_ns < end)]
+        told = np.interp(np.append(inside, end), odometry_ns, wheels) - np.interp(begin, odometry_ns, wheels)
+        stamps.append(inside)
+        poses.append(_turned(add[k] + told[:-1]) @ R[k])
+        add[k + 1 :] += told[-1] - float(wrap(yaw[k + 1] - yaw[k]))
+        a, b = np.interp([begin, end], odometry_ns, moved)
+        unseen += np.clip(moved, a, b) - a
+    ns, all_R = np.concatenate(stamps), np.concatenate([_turned(add) @ R, *poses])
+    order = np.argsort(ns, kind="stable")
+    return ns[order], all_R[order], unseen
+
+
+def _turned(yaw: Array) -> Array:
+    """Rotations (K, 3, 3) about the vertical."""
+    return np.asarray(planar(np.zeros(len(yaw)), np.zeros(len(yaw)), yaw)[:, :3, :3])
 
 
 def _from_fixes(streams: Streams, inertial: Inertial | None, config: MotionConfig) -> Motion | None:

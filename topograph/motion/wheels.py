@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_opening
 
-from topograph.geometry import Array, Datum, Stamps, interpolate, transform, wrap, yaw_of
+from topograph.geometry import Array, Datum, Stamps, interpolate, transform
 from topograph.motion.streams import Streams
 
 GOOD_FIX = 0.15
@@ -16,14 +16,14 @@ GOOD_FIX = 0.15
 LONGEST_S = 1.5
 """Between two fixes that tell a speed."""
 WINDOW_S = 1.0
-"""Over which speeds are compared: the median of the fixes' steps, so that a jump of GNSS is no slip."""
+"""Over which ways are compared."""
 SLIP = (0.12, 0.14)
 """Difference of speeds that is a slip: m/s, and share of the faster one. Reflections make fixes wander by up to 0.2 m/s; slips
 below that are for the graph, where the trunks speak too."""
-CALM = (0.15, 3.0)
-"""Fixes whose speeds within a window differ by more, m/s and times their noise, tell nothing of wheels."""
 FASTEST = 12.0
 """A field robot's or tractor's speed, m/s; faster fixes are jumps."""
+SURE = 5.0
+"""Deviations by which the way between two fixes has to differ from the wheels'."""
 SCALE_WINDOW_S = 3.0
 SCALE = 0.03
 """Wheels whose scale is off by more are corrected; by less is what the graph's noise allows for."""
@@ -70,31 +70,60 @@ def against_fixes(streams: Streams, odom_T_robot: Array, robot_p_antenna: Array)
     antenna = transform(poses, robot_p_antenna)[:, :2]
     scale = _scale(at, enu, antenna, sigma)
     dt = np.diff(at) * 1e-9
-    near = (dt > 1e-3) & (dt < LONGEST_S)
-    if near.sum() < LEAST_WINDOWS:
+    step = float(np.median(dt))
+    half = max(1, round(0.5 * WINDOW_S / max(step, 1e-3)))
+    if len(at) < LEAST_WINDOWS + 2 * half:
         return nothing
-    middle = (at[:-1] + np.diff(at) // 2)[near]
-    # Speeds of the base: what the antenna does for the turn alone is taken off.
-    turn = wrap(np.diff(yaw_of(poses)))[near] / dt[near]
-    v_fix = np.linalg.norm(np.diff(enu, axis=0), axis=1)[near] / dt[near]
-    v_fix = np.sqrt(np.maximum(v_fix**2 - (turn * robot_p_antenna[0]) ** 2, 0.0)) + turn * robot_p_antenna[1]
-    v_fix = np.abs(v_fix)
-    v_wheel = scale * np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)[near] / dt[near]
-    noise = np.hypot(sigma[1:], sigma[:-1])[near] / dt[near]
-    v_fix, v_wheel, spread, sure = _windowed(middle, v_fix, v_wheel, noise)
-    slipping = np.abs(v_fix - v_wheel) > SLIP[0] + SLIP[1] * np.maximum(v_fix, v_wheel) + 2.0 * sure
-    slipping &= (spread < CALM[0] + CALM[1] * noise) & (v_fix < FASTEST)
+    k = np.arange(half, len(at) - half)
+    a, b = k - half, k + half
+    seconds = (at[b] - at[a]) * 1e-9
+    # Twice: the way between a window's ends, which noise does not lengthen, and the median of its steps, which no jump moves.
+    noise = np.hypot(sigma[a], sigma[b])
+    way = np.linalg.norm(enu[b] - enu[a], axis=1)
+    base = scale * (poses[b, :2, 3] - poses[a, :2, 3])
+    turn = (antenna[b] - antenna[a]) - base / scale  # what the antenna does for the turn alone
+    told = np.linalg.norm(base + turn, axis=1)
+    apart = np.abs(way - told)
+    slipping = (apart > SURE * noise) & (apart > (SLIP[0] + SLIP[1] * np.maximum(way, told) / seconds) * seconds)
+    speed = np.linalg.norm(np.diff(enu, axis=0), axis=1) / np.maximum(dt, 1e-3)
+    wheel = np.linalg.norm(np.diff(antenna, axis=0), axis=1) / np.maximum(dt, 1e-3)
+    rows = a[:, None] + np.arange(2 * half)
+    still = 1.18 * np.median(
+        np.hypot(sigma[1:], sigma[:-1])[rows] / np.maximum(dt[rows], 1e-3), axis=1
+    )  # of noise alone
+    middle = np.sqrt(np.maximum(np.median(speed[rows], axis=1) ** 2 - still**2, 0.0))
+    slipping &= np.abs(middle - scale * np.mean(wheel[rows], axis=1)) > 0.5 * apart / seconds
+    slipping &= (
+        (np.abs(middle * seconds - way) < 0.5 * apart + 3.0 * noise) & (middle < FASTEST) & (seconds < 2.0 * LONGEST_S)
+    )
     slipping = _lasting(slipping)
-    seconds = np.diff(ns) * 1e-9
+    length, reach = np.linalg.norm(base, axis=1), np.sqrt(np.maximum(way**2 - 2.0 * noise**2, 0.0))
+    blocked = length < 0.1 * reach
+    by = np.where(blocked, 0.0, _factor(base, turn, reach))
     centre = ns[:-1] + np.diff(ns) // 2
-    inside = np.interp(centre, middle, slipping.astype(float), left=0.0, right=0.0) > 0
-    told, wheel = np.interp(centre, middle, v_fix), np.interp(centre, middle, v_wheel)
+    where = at[k]
+    inside = np.interp(centre, where, slipping.astype(float), left=0.0, right=0.0) > 0
     factor = np.full(steps, scale)
-    stands = inside & (wheel < 0.05)
-    factor[inside & ~stands] *= np.clip(told / np.maximum(wheel, 1e-6), 0.0, 20.0)[inside & ~stands]
-    advance = np.where(stands, told * seconds, 0.0)
-    doubt = np.where(inside, (SLIP_SIGMA * np.abs(told - wheel) + 0.05) * seconds, 0.0)
-    return WheelCheck(factor, advance, doubt, scale, _spans(centre, inside, told - wheel, ns[0]))
+    factor[inside] *= np.interp(centre, where, by)[inside]
+    stands = np.interp(centre, where, blocked.astype(float)) > 0.5
+    forward = np.interp(centre, where, reach / seconds) * np.diff(ns) * 1e-9
+    factor[inside & stands] = scale
+    advance = np.where(inside & stands, forward, 0.0)
+    off = np.interp(centre, where, (way - told) / seconds)
+    doubt = np.where(inside, (SLIP_SIGMA * np.abs(off) + 0.05) * np.diff(ns) * 1e-9, 0.0)
+    return WheelCheck(factor, advance, doubt, scale, _spans(centre, inside, off, ns[0]))
+
+
+def _factor(base: Array, turn: Array, reach: Array) -> Array:
+    """What the base's moves (K, 2) have to be multiplied with for the antenna to get as far as `reach` (K,); `turn` (K, 2) is what
+    it does beside: |f base + turn| = reach, the root nearest to 1.
+    """
+    A = np.maximum(np.sum(base**2, axis=1), 1e-9)
+    B, C = np.sum(base * turn, axis=1), np.sum(turn**2, axis=1) - reach**2
+    root = np.sqrt(np.maximum(B**2 - A * C, 0.0))
+    both = np.stack([(-B + root) / A, (-B - root) / A])
+    near = np.abs(both - 1.0).argmin(axis=0)
+    return np.asarray(np.clip(both[near, np.arange(len(A))], 0.0, 20.0))
 
 
 def _scale(at: Stamps, enu: Array, antenna: Array, sigma: Array) -> float:
@@ -110,16 +139,6 @@ def _scale(at: Stamps, enu: Array, antenna: Array, sigma: Array) -> float:
     middle = float(np.median(ratio))
     spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
     return middle if abs(middle - 1.0) > max(SCALE, spread) and 0.2 < middle < 5.0 else 1.0
-
-
-def _windowed(at: Stamps, v_fix: Array, v_wheel: Array, noise: Array) -> tuple[Array, Array, Array, Array]:
-    """Around each step, at least five: median of the fixes' speeds, mean of the wheels', the fixes' spread, noise of the median."""
-    step = float(np.median(np.diff(at))) * 1e-9
-    half = max(2, round(0.5 * WINDOW_S / max(step, 1e-3)))
-    rows = np.clip(np.arange(len(at))[:, None] + np.arange(-half, half + 1), 0, len(at) - 1)
-    middle = np.median(v_fix[rows], axis=1)
-    spread = 1.4826 * np.median(np.abs(v_fix[rows] - middle[:, None]), axis=1)
-    return middle, np.mean(v_wheel[rows], axis=1), spread, noise / np.sqrt(2 * half + 1)
 
 
 def _lasting(slipping: NDArray[np.bool_]) -> NDArray[np.bool_]:

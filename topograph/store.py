@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import glob
 import hashlib
 import os
@@ -182,7 +183,9 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
     try:
         c.execute("PRAGMA trusted_schema=OFF")
         c.execute("PRAGMA cell_size_check=ON")
-        foreign = c.execute("SELECT name FROM sqlite_master WHERE type IN ('view', 'trigger')").fetchall()
+        foreign = c.execute(  # the spatial indices that QGIS makes are harmless: nothing is written through them here
+            "SELECT name FROM sqlite_master WHERE type IN ('view', 'trigger') AND name NOT LIKE 'rtree_%' AND name NOT LIKE 'trigger_%_feature_count_%'"
+        ).fetchall()
         if foreign:
             raise MapError(f"{path}: holds a view or a trigger ({foreign[0][0]}), which no map does: it is not read")
         row = c.execute("SELECT value FROM meta WHERE key='schema_version'").fetchone()
@@ -199,14 +202,15 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
         c.close()
 
 
-_DIGESTED = ("trees", "edges", "path", "meta")
+_DIGESTED = ("trees", "edges", "path", "viewpoints", "meta")
 
 
 def _digest(c: sqlite3.Connection, table: str) -> str:
     """SHA-256 over the rows of a table; of `meta` without the digests themselves."""
     where = " WHERE key NOT LIKE 'digest:%' ORDER BY key" if table == "meta" else " ORDER BY id"
+    columns = "id, tree, vx, vy, vz, points, crc" if table == "viewpoints" else "*"  # clouds have a CRC each
     h = hashlib.sha256()
-    for row in c.execute(f"SELECT * FROM {table}{where}"):  # the names are those above
+    for row in c.execute(f"SELECT {columns} FROM {table}{where}"):  # the names are those above
         h.update(repr(row).encode())
     return h.hexdigest()
 
@@ -224,33 +228,38 @@ def _check_digests(c: sqlite3.Connection, path: Path) -> None:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """The one writer of a map, from loading it to saving it.
+    """The one writer of a map, from loading it to saving it. The lock dies with its process; who holds it stands in the lock file.
 
     Raises:
         MapError: somebody else writes it.
     """
+    path = path.resolve()
     lock = path.with_name(f".{path.name}.lock")
-    mine = f"{os.getpid()} {socket.gethostname()}"
-    for _ in range(2):
+    if not path.parent.is_dir():
+        raise MapError(f"{path}: there is no folder {path.parent}")
+    while True:
         try:
-            lock.parent.mkdir(parents=True, exist_ok=True)
-            with lock.open("x") as f:
-                f.write(mine)
-            break
-        except FileExistsError:
-            pid, host = (lock.read_text().split() + ["0", "?"])[:2]
-            if host == socket.gethostname() and not _alive(int(pid)):
-                lock.unlink(missing_ok=True)  # its writer was killed
-                continue
-            raise MapError(
-                f"{path}: process {pid} on {host} is writing it; wait, or remove {lock.name} if it is gone"
-            ) from None
+            handle = lock.open("a+")
         except OSError as err:
-            raise MapError(f"{path}: cannot be written ({err})") from err
+            raise MapError(f"{path}: cannot be written ({err.strerror})") from err
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            handle.seek(0)
+            who = handle.read(200).strip() or "another process"
+            handle.close()
+            raise MapError(f"{path}: {who} is writing it; wait until it is done") from None
+        if lock.exists() and os.fstat(handle.fileno()).st_ino == lock.stat().st_ino:
+            break
+        handle.close()  # its holder has just finished, and removed it
     try:
+        handle.truncate(0)
+        handle.write(f"process {os.getpid()} on {socket.gethostname()}")
+        handle.flush()
         yield
     finally:
         lock.unlink(missing_ok=True)
+        handle.close()
 
 
 def _alive(pid: int) -> bool:
@@ -258,7 +267,7 @@ def _alive(pid: int) -> bool:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    except OSError:
+    except (OSError, OverflowError):
         return True
     return True
 
@@ -288,7 +297,7 @@ def load(path: Path | str, *, clouds: bool = True, check: bool = True) -> TopoMa
             'sightings, score, "row"' + newer + " FROM trees ORDER BY id"
         ).fetchall()
         v = np.array([[np.nan if x is None else x for x in r[:16]] for r in rows], float).reshape(-1, 16)
-        kind = np.array([KINDS.index(r[16]) for r in rows], np.int64)
+        kind = np.array([KINDS.index(r[16]) if r[16] in KINDS or check else 0 for r in rows], np.int64)
         chance = np.array([np.nan if r[17] is None else r[17] for r in rows], float)
         ids = v[:, 0].astype(np.int64)
         cov = np.zeros((len(v), 3, 3))

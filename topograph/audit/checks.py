@@ -41,6 +41,12 @@ TILT = 0.07
 """Mean lean of all trunks in the robot's own frame, rad (clean: up to 0.03, where axes are recorded; 0.01 in LiDAR runs)."""
 DRIFT = (0.05, 6.0)
 """Fixes may drift so far while the wheels stand, m and standard deviations (clean: 0.01)."""
+REFUSING = ("moving",)
+"""Findings that refuse a map."""
+ALIKE_S = 6.0
+"""Errors of fixes last for so long."""
+PAIRS = 3
+"""Of trees that stand twice, at least."""
 STAND_S = 2.0
 """Shorter stands say nothing."""
 
@@ -118,23 +124,29 @@ def standing(streams: Streams, motion: Motion) -> Iterator[Finding]:
         return
     v = np.diff(motion.distance) / np.maximum(np.diff(motion.stamps_ns) * 1e-9, 1e-3)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], (v < 0.01).astype(int), [0]]))).reshape(-1, 2)
-    worst, when = 0.0, 0.0
+    worst, when, most = 0.0, 0.0, DRIFT[0]
     for a, b in edges.tolist():
-        begin, end = motion.stamps_ns[a], motion.stamps_ns[b]
-        inside = (streams.fix_ns >= begin) & (streams.fix_ns <= end)
-        slipping = any(x - 1 < (begin - motion.stamps_ns[0]) * 1e-9 < y + 1 for x, y, _ in motion.slips)
-        if end - begin < STAND_S * 1e9 or inside.sum() < 6 or slipping:
+        begin, end = motion.stamps_ns[a], motion.stamps_ns[min(b, len(motion.stamps_ns) - 1)]
+        seconds = (begin - motion.stamps_ns[0]) * 1e-9
+        slipping = any(x - 1 < seconds < y + 1 for x, y, _ in motion.slips)
+        if end - begin < STAND_S * 1e9 or slipping:
             continue
-        sigma = float(np.sqrt(np.median(streams.fix_cov[inside][:, 0, 0])))
-        g = streams.lat_lon_h[inside]
+        i, j = np.searchsorted(streams.fix_ns, [begin, end])
+        if j - i < 6:
+            continue
+        sigma = float(np.sqrt(np.median(streams.fix_cov[i:j, 0, 0])))
+        g = streams.lat_lon_h[i:j]
         enu = (g[:, :2] - g[0, :2]) * 111_320.0 * np.array([1.0, np.cos(np.radians(g[0, 0]))])
         n = max(2, len(enu) // 3)
         moved = float(np.linalg.norm(np.median(enu[-n:], axis=0) - np.median(enu[:n], axis=0)))
-        if moved > max(DRIFT[0], DRIFT[1] * max(sigma, 0.005) / np.sqrt(n)) and moved > worst:
-            worst, when = moved, (begin - motion.stamps_ns[0]) * 1e-9
+        # Neighbours in time err alike: a stand holds as many independent fixes as it lasts time constants.
+        free = max(1.0, (end - begin) * 1e-9 / 3.0 / ALIKE_S)
+        bound = max(DRIFT[0], DRIFT[1] * max(sigma, 0.005) / np.sqrt(free))
+        if moved > bound and moved > worst:
+            worst, when, most = moved, seconds, bound
     if worst > 0:
         yield Finding(
-            name="fixes drift", value=worst, bound=DRIFT[0], unit="m",
+            name="fixes drift", value=worst, bound=most, unit="m",
             sentence=f"fixes moved by {100 * worst:.0f} cm while the wheels stood (at {when:.0f} s): GNSS is worse than it states, or the wheels were blocked",
         )  # fmt: skip
 
@@ -224,8 +236,9 @@ SEEN_ANEW = 12.0
 
 
 def twice(xy: Array) -> float:
-    """Share of trees (T, 2) that have another one nearer than a quarter of the usual distance."""
+    """Share of trees (T, 2) that have another one nearer than a quarter of the usual distance; 0 where they are fewer than PAIRS pairs."""
     if len(xy) < 6:
         return 0.0
     distance = np.asarray(cKDTree(xy).query(xy, k=2)[0])[:, 1]
-    return float((distance < 0.25 * np.median(distance)).mean())
+    near = distance < 0.25 * np.median(distance)
+    return float(near.mean()) if near.sum() >= 2 * PAIRS else 0.0

@@ -46,6 +46,15 @@ class Frames:
                 queue.append((there, base_T_there))
         return None
 
+    def of(self, kind: str, frame: str) -> Array | None:
+        """`base_T_frame` (4, 4) of the sensor of a stream; None where nobody tells: its frame has no name or no way to the base.
+
+        An extrinsic may be given by the stream's kind too ("fix", "imu", "heading").
+        """
+        if kind in self._given:
+            return self._given[kind]
+        return self.find(frame) if frame else None
+
     def get(self, frame: str) -> Array:
         """`base_T_frame` (4, 4).
 

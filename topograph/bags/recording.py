@@ -47,6 +47,9 @@ class Recording:
         start_ns, log_ns: recording time of the first message, and of the one that was given last.
         clocks: what the last reading found of the streams' clocks.
         undecoded: stream kind -> why the first message that could not be decoded could not.
+        given: stream kind -> messages that the file held, usable or not, in the last reading.
+        untimed: scans without a time per point, counted by who takes them.
+        count_within: times of recording (from, until before), ns, of the messages that are counted; None: all.
     """
 
     def __init__(self, paths: Sequence[Path], config: BagsConfig | None = None) -> None:
@@ -61,6 +64,10 @@ class Recording:
         self.start_ns = self.log_ns = 0
         self.clocks = Clocks(self.skipped)
         self.undecoded: dict[str, str] = {}
+        self.given: Counter[str] = Counter()
+        self.untimed = 0
+        self.count_within: tuple[int, int] | None = None
+        self._counting = True
         self._readers: list[AnyReader] = []
         self._stack = ExitStack()
 
@@ -142,19 +149,25 @@ class Recording:
 
     def _decoded(self, wanted: dict[str, str], window_ns: tuple[int, int] | None) -> Iterator[Message]:
         """Products in order of recording, stamps as they are; what the index announces and the file does not give is counted."""
-        given: Counter[str] = Counter()
+        self.given = Counter()
         merged = heapq.merge(
             *(self._raw(i, set(wanted), window_ns) for i in range(len(self._readers))), key=lambda m: m[1]
         )
         for i, log_ns, connection, raw in merged:
-            given[connection.topic] += 1
+            within = self.count_within
+            self._counting = within is None or within[0] <= log_ns < within[1]
+            self.given[wanted[connection.topic]] += self._counting
             product = self._product(wanted[connection.topic], self._readers[i], connection, raw)
             if product is not None:
                 yield Message(wanted[connection.topic], log_ns, product)
         if window_ns is None:
             for topic, kind in wanted.items():
-                if self.counts[topic] > given[topic]:
-                    self.skipped[f"{kind}: {DAMAGED}"] += self.counts[topic] - given[topic]
+                self.count_missing(topic, kind)
+
+    def count_missing(self, topic: str, kind: str) -> None:
+        """Count what the index announces and the file did not give."""
+        if self.counts[topic] > self.given[kind]:
+            self.skipped[f"{kind}: {DAMAGED}"] += self.counts[topic] - self.given[kind]
 
     def _raw(
         self, i: int, names: set[str], window_ns: tuple[int, int] | None
@@ -180,7 +193,7 @@ class Recording:
             if kind == "odometry":
                 odometry = decode.unpack_odometry(raw, reader.is2)
                 if not np.isfinite(odometry.odom_T_child).all() or not odometry.odom_T_child[3:].any():
-                    self.skipped["odometry: not finite"] += 1
+                    self._count("odometry: not finite")
                     return None
                 return odometry
             message: Any = reader.deserialize(raw, typ)
@@ -191,20 +204,25 @@ class Recording:
             if kind == "heading":
                 heading = decode.decode_heading(message)
                 if not np.isfinite(heading.yaw):
-                    self.skipped["heading: not finite"] += 1
+                    self._count("heading: not finite")
                     return None
                 return heading
             return decode.decode_trunks(message)
         except Exception as err:  # noqa: BLE001  # one message; it is counted, and read_run bounds how many
-            self.skipped[f"{kind}: {UNDECODED}"] += 1
+            self._count(f"{kind}: {UNDECODED}")
             self.undecoded.setdefault(kind, str(err) or type(err).__name__)
             log.debug("%s: %s", connection.topic, err)
             return None
 
+    def _count(self, reason: str) -> None:
+        self.skipped[reason] += self._counting
+        if not self.skipped[reason]:
+            del self.skipped[reason]
+
     def _finite_imu(self, imu: Imu) -> Imu | None:
         if np.isfinite(imu.gyro).all() and np.isfinite(imu.accel).all():
             return imu
-        self.skipped["imu: not finite"] += 1
+        self._count("imu: not finite")
         return None
 
 

@@ -61,9 +61,13 @@ def map_command(
 ) -> None:  # fmt: skip
     """Make a map of the trees in BAGS (one run)."""
     from topograph import pipeline, store
+    from topograph.audit import REFUSING
 
     if output is not None and into is not None:
         raise UsageError("-o makes a new map, --into extends one: give one of them")
+    unknown = sorted(set(accept) - set(REFUSING))
+    if unknown:
+        raise UsageError(f"--accept {unknown[0]}: nothing is refused for that; known are {', '.join(REFUSING)}")
     config = config_of(config_file, words)
     true = truth_of(truth)
     with ExitStack() as stack:
@@ -445,7 +449,7 @@ def repair(map_file: Path, output: Path) -> None:
         topo = store.load(map_file, check=False, clouds=False)
         lost = f"; all clouds were left out ({err})"
     with store.locked(output):
-        store.save(topo, output)
+        store.save(replace(topo, meta={**topo.meta, "verdict": "repaired"}), output)
     click.echo(
         f"{output}: {len(topo)} trees, {len(topo.edges)} edges, {len(topo.viewpoints)} clouds{lost}; nobody can say which of them are damaged: look at them"
     )

@@ -147,19 +147,20 @@ def results_folder(folder: Path | None) -> Iterator[Path]:
     given = folder is not None
     root = Path("results")
     out = folder if folder is not None else root / datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S_%f")
-    there = out.exists()
+    made = [p for p in (out, *out.parents) if not p.exists()]
     out.mkdir(parents=True, exist_ok=True)
     try:
         yield out
-    finally:
-        if not any(out.iterdir()):
-            if not there:
-                out.rmdir()
-        elif not given:
-            link, part = root / "latest", root / f".latest.{os.getpid()}"
-            part.unlink(missing_ok=True)
-            part.symlink_to(out.name)
-            part.replace(link)
+    except BaseException:
+        for p in made:
+            if p.is_dir() and not any(p.iterdir()):
+                p.rmdir()
+        raise
+    if not given:
+        link, part = root / "latest", root / f".latest.{os.getpid()}"
+        part.unlink(missing_ok=True)
+        part.symlink_to(out.name)
+        part.replace(link)
 
 
 def hash_of(path: Path) -> str:

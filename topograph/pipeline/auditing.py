@@ -38,7 +38,7 @@ def _mounts(solved: Solved) -> list[Finding]:
             Finding(
                 name="antenna unknown", value=1.0, bound=0.0001, unit="",
                 sentence=f"nobody says where the antenna sits (frame {run.streams.frames['fix']!r} is not in TF): the map lies off by its lever arm; "
-                f"add --extrinsic {run.streams.frames['fix'] or 'FRAME'}=X,Y,Z,ROLL,PITCH,YAW",
+                f"add --extrinsic {run.streams.frames['fix'] or 'fix'}=X,Y,Z,ROLL,PITCH,YAW",
             )
         )  # fmt: skip
     mount = run.mounts.get("imu")

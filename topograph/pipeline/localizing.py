@@ -17,7 +17,7 @@ from topograph.config import Config
 from topograph.errors import InsufficientDataError
 from topograph.geometry import Array
 from topograph.localize import Fix, GraphMethod, Localizer, Move, Report, Sweep, ThesisMethod, smooth
-from topograph.pipeline.read import WHOLE, Progress, child_mount, silent, stream
+from topograph.pipeline.read import WHOLE, Progress, child_mount, refuse_damaged, silent, stream
 from topograph.topomap import TopoMap
 
 
@@ -93,6 +93,8 @@ def localize_bags(
                 out.distance.append((out.distance[-1] if out.distance else 0.0) + localizer.leg.distance)
                 if isinstance(localizer.method, GraphMethod):
                     stretch.add(report, localizer.method)
+        refuse_damaged(recording)
+        out.notes += recording.clocks.notes
     out.seconds["read, detect and localize"] = time.perf_counter() - began
     if localizer is None:
         raise InsufficientDataError("no scan in the recording (or in the part that was asked for)")

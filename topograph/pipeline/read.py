@@ -91,6 +91,7 @@ def stream(
     progress("read", 1.0)
 
 
+BROKE = "the front end failed on it"
 WAIT_NS = 250_000_000
 """After a scan was recorded, its motion has been too: wheels and IMU are late by less."""
 
@@ -114,7 +115,7 @@ def _careful(
     try:
         yield detect(scan, builder)
     except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError) as err:
-        skipped["points: the front end failed on it"] += 1
+        skipped[f"points: {BROKE}"] += 1
         log.warning("the scan of %.3f s broke the front end: %r", scan.stamp_ns * 1e-9, err)
 
 
@@ -139,20 +140,21 @@ def read_run(
         builder = StreamsBuilder()
         trunks: list[Trunks] = []
         if jobs > 1 and "points" in recording.chosen and span_s == WHOLE:
-            trunks = _in_parts(recording, config, jobs, builder, progress)
+            found = _in_parts(recording, config, jobs, builder, progress)
+            if found is None:
+                return read_run(paths, config, progress, span_s)
+            trunks = found
         else:
             for product in stream(recording, config, progress, span_s):
                 if isinstance(product, Trunks):
                     trunks.append(product)
                 else:
                     builder.add(product)
-        _refuse_damaged(recording, trunks)
+        refuse_damaged(recording)
         notes += recording.clocks.notes
         streams = builder.build(recording.skipped)
         mounts: dict[str, Array | None] = {
-            k: recording.frames.find(streams.frames[k]) if streams.frames[k] else None
-            for k in ("imu", "fix", "heading")
-            if k in streams.frames
+            k: recording.frames.of(k, streams.frames[k]) for k in ("imu", "fix", "heading") if k in streams.frames
         }
         for k, name in (("fix", "antenna"), ("heading", "heading")):
             if k in mounts and mounts[k] is None:
@@ -160,7 +162,7 @@ def read_run(
                     f"{name} frame {streams.frames[k]!r} is not in TF: taken at the base; "
                     f"add --extrinsic {streams.frames[k]}=X,Y,Z,ROLL,PITCH,YAW"
                 )
-        if recording.skipped[_NO_TIME]:
+        if recording.untimed > UNTIMED * max(len(trunks), 1):
             notes.append(_smear(streams, trunks))
         child_T_robot = child_mount(recording, streams.frames.get("child", ""), config, notes)
         skipped = recording.skipped
@@ -183,11 +185,11 @@ MOST_DAMAGED = 0.2
 """Share of a needed stream that may be damaged."""
 
 
-def _refuse_damaged(recording: Recording, trunks: Sequence[Trunks]) -> None:
+def refuse_damaged(recording: Recording) -> None:
     """Raise InputError where a needed stream is mostly damaged: what is left of it would pass for the whole."""
     for kind in ("points", "trunks", "odometry"):
         topic = recording.chosen.get(kind)
-        bad = sum(recording.skipped[f"{kind}: {why}"] for why in (DAMAGED, UNDECODED))
+        bad = sum(recording.skipped.get(f"{kind}: {why}", 0) for why in (DAMAGED, UNDECODED, BROKE))
         if topic is None or bad <= MOST_DAMAGED * recording.counts[topic]:
             continue
         why = recording.undecoded.get(
@@ -196,7 +198,8 @@ def _refuse_damaged(recording: Recording, trunks: Sequence[Trunks]) -> None:
         raise InputError(f"{topic}: {bad} of {recording.counts[topic]} messages cannot be read ({why})")
 
 
-_NO_TIME = "points: no time per point, not deskewed"
+UNTIMED = 0.02
+"""Share of sweeps without times that is worth a word."""
 
 
 def _smear(streams: Streams, trunks: Sequence[Trunks]) -> str:
@@ -217,13 +220,27 @@ _LAG_NS = 2_000_000_000
 """A message is recorded at most this long after its stamp, or it is of no use to a scan of another part."""
 
 
+@dataclass(slots=True)
+class _Part:
+    """Trunks of the scans that were recorded within one part of a recording, and the account of its point clouds."""
+
+    trunks: list[Trunks]
+    skipped: Counter[str]
+    given: int
+    undecoded: dict[str, str]
+    clocks: list[str]
+    untimed: int
+
+
 def _in_parts(
     recording: Recording, config: Config, jobs: int, builder: StreamsBuilder, progress: Progress
-) -> list[Trunks]:
-    """Trunks of all scans, by several processes; the small streams go into `builder` meanwhile."""
+) -> list[Trunks] | None:
+    """Trunks of all scans, by several processes; the small streams go into `builder` meanwhile. None where clocks need mending: that
+    is told from the whole recording, not from parts.
+    """
     edges = np.linspace(recording.start_ns, recording.start_ns + int(recording.duration_s * 1e9) + 1, jobs + 1)
     edges = edges.astype(np.int64)
-    parts: list[list[Trunks]] = []
+    parts: list[_Part] = []
     # Fresh processes: a fork would inherit the locks of the libraries' threads.
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         waiting = [
@@ -233,18 +250,22 @@ def _in_parts(
         for _, product in recording.messages(("odometry", "imu", "fix", "heading")):
             assert not isinstance(product, (Scan, Trunks))
             builder.add(product)
-        for n, part in enumerate(waiting):
-            trunks, skipped = part.result()
-            parts.append(trunks)
-            recording.skipped.update(skipped)
+        for n, waited in enumerate(waiting):
+            parts.append(waited.result())
             progress("read", (n + 1) / jobs)
-    return [t for part in parts for t in part]
+    if recording.clocks.notes or any(p.clocks for p in parts):
+        return None
+    for part in parts:
+        recording.skipped.update(part.skipped)
+        recording.undecoded.update(part.undecoded)
+        recording.untimed += part.untimed
+        recording.given["points"] += part.given
+    recording.count_missing(recording.chosen["points"], "points")
+    return [t for part in parts for t in part.trunks]
 
 
-def _detect_part(
-    paths: Sequence[Path], config: Config, start_ns: int, stop_ns: int
-) -> tuple[list[Trunks], Counter[str]]:
-    """Trunks of the scans recorded from `start_ns` until before `stop_ns`."""
+def _detect_part(paths: Sequence[Path], config: Config, start_ns: int, stop_ns: int) -> _Part:
+    """The scans recorded from `start_ns` until before `stop_ns`."""
     out: list[Trunks] = []
     with Recording(paths, config.bags) as recording:
         detect = _detector(recording, config)
@@ -252,6 +273,7 @@ def _detect_part(
         pending: list[tuple[int, Scan]] = []
         seen: set[int] = set()
         window = (max(start_ns - _LAG_NS, recording.start_ns), stop_ns + _LAG_NS)
+        recording.count_within = (start_ns, stop_ns)
         for _, product in recording.messages(("points", "odometry", "imu"), window):
             if isinstance(product, Scan):
                 repeated = product.stamp_ns in seen
@@ -267,7 +289,9 @@ def _detect_part(
                 out += _careful(detect, pending.pop(0)[1], builder, recording.skipped)
         for _, scan in pending:
             out += _careful(detect, scan, builder, recording.skipped)
-        return out, Counter({k: v for k, v in recording.skipped.items() if k.startswith("points")})
+        given = recording.given["points"]
+        skipped = Counter({k: v for k, v in recording.skipped.items() if k.startswith("points")})
+        return _Part(out, skipped, given, recording.undecoded, recording.clocks.notes, recording.untimed)
 
 
 def child_mount(recording: Recording, child: str, config: Config, notes: list[str]) -> Array:
@@ -298,7 +322,7 @@ def _detector(recording: Recording, config: Config) -> Callable[[Scan, StreamsBu
             mount = recording.frames.find(streams.imu[0].frame)
             robot_R_imu = None if mount is None else mount[:3, :3]
         if scan.offset is None:
-            recording.skipped[_NO_TIME] += 1
+            recording.untimed += 1
         first, last = scan.stamp_ns, scan.stamp_ns
         if scan.offset is not None and len(scan.offset):
             first += int(np.nanmin(scan.offset) * 1e9)

@@ -170,6 +170,16 @@ def test_a_clock_that_is_set_goes_on(tmp_path: Path, by: float) -> None:
     assert any("its clock was set" in n for n in r.clocks.notes)
 
 
+def test_a_backlog_that_newer_messages_overtake(tmp_path: Path) -> None:
+    at = [0.01 * k for k in range(4000)]
+    logs = [25.02 + 1e-6 * k if 20.0 <= s < 25.0 else s for k, s in enumerate(at)]
+    with Recording([imus(tmp_path / "a.bag", at, logs)]) as r:
+        got = [m.stamp_ns for _, m in r.messages()]
+    assert sorted(got) == [T0 + int(s * 1e9) for s in at]
+    assert not r.skipped
+    assert not r.clocks.notes
+
+
 @pytest.mark.parametrize("stall", [3.0, 8.0])
 def test_a_backlog_is_late_and_no_clock_that_was_set(tmp_path: Path, stall: float) -> None:
     """A recorder or a link that stalls delivers in one burst what waited: the stamps are as good as ever."""

@@ -76,6 +76,9 @@ def test_map_of_a_run(tmp_path: Path, detections_run: tuple[Path, Truth]) -> Non
     np.testing.assert_array_equal(extended.ids, topo.ids)
     assert (extended.sightings > topo.sightings).all()
     assert np.linalg.norm(extended.p - topo.p, axis=1).max() < 0.05
+    assert (extended.p != topo.p).any(axis=1).all()  # seen again, they are placed anew
+    sure, before = (np.trace(t.cov[:, :2, :2], axis1=1, axis2=2) for t in (extended, topo))
+    assert (sure <= before + 1e-12).all()
 
 
 def test_compare_prints_both(tmp_path: Path, detections_run: tuple[Path, Truth]) -> None:

@@ -219,15 +219,18 @@ def test_a_kidnapped_robot_notices(lattice: bool) -> None:
         w = world(c, np.random.default_rng([seed, 8]))
         engine = Engine(index_of(w.mapped, config), config)
         jump = np.array([c.spacing, -c.row_spacing, 0.0]) if lattice else None
-        driven, right = 0.0, 0
+        driven, right, wrong = 0.0, 0, 0.0
         for s in drive(w, c, np.random.default_rng([seed, 9]), 22.0, jump_at=10.0, jump=jump):
             driven += s.distance
             b = feed(engine, s, c)
+            if driven > 10.0 and b.pose is not None and np.hypot(*(b.pose[:2] - s.pose[:2])) > 0.5:
+                wrong += s.distance
             if driven > 16.0:
                 assert b.pose is None or np.hypot(*(b.pose[:2] - s.pose[:2])) < 0.5
                 right += b.pose is not None
         assert engine.losses >= 1
         assert right > 5
+        assert wrong < 0.6  # by the alarms, before the second opinion is asked
 
 
 # -- dead reckoning -----------------------------------------------------------------------------------------------

@@ -176,6 +176,18 @@ def test_edges_do_not_depend_on_scale() -> None:
     assert nearest <= {(int(i), int(j)) for i, j in a}  # the nearest neighbour is always a neighbour
 
 
+def test_edges_are_those_of_the_gabriel_graph() -> None:
+    """By its definition: no third tree in the circle over an edge; and every such pair is one, but for the long ones of the rim."""
+    xy = np.stack(np.meshgrid(np.arange(7) * 5.0, np.arange(6) * 4.0), axis=2).reshape(-1, 2)
+    xy = xy + np.random.default_rng(5).uniform(-0.8, 0.8, xy.shape)
+    middle, half = 0.5 * (xy[:, None] + xy[None]), 0.5 * np.linalg.norm(xy[:, None] - xy[None], axis=2)
+    inside = np.linalg.norm(middle[:, :, None] - xy[None, None], axis=3) < half[:, :, None] - 1e-9
+    pairs = {(i, j) for i in range(len(xy)) for j in range(i + 1, len(xy)) if not inside[i, j].any()}
+    found = {(int(i), int(j)) for i, j in neighbours(xy, TopomapConfig())}
+    assert found <= pairs
+    assert {(i, j) for i, j in pairs if half[i, j] < 4.0} <= found
+
+
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 5])
 def test_edges_of_few_or_lined_up_trees(n: int) -> None:
     xy = np.stack([np.arange(n, dtype=float), np.zeros(n)], axis=1)

@@ -11,7 +11,7 @@ from topograph.config import Config
 from topograph.evaluate import Truth, trunk_metrics
 from topograph.geometry import exp
 from topograph.pipeline import read_run
-from topograph.trunks import ThesisTrunksConfig, TrunksConfig
+from topograph.trunks import ThesisTrunksConfig, TrunksConfig, fit
 from topograph.trunks.detector import Detector, candidates
 from topograph.trunks.features import FEATURES
 from topograph.trunks.fit import AXIS_Z, OUT_SIZE, X, suppress, vertical
@@ -270,3 +270,16 @@ def test_a_post_beside_a_tree_is_kept_apart() -> None:
     assert suppress(fits, odds, np.array([-1.0, 1.0]), 0.45).tolist() == [0, 1]
     fits[1, X] = 0.05
     assert suppress(fits, odds, np.array([-1.0, 1.0]), 0.45).tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("bearing", [0.0, 0.7, np.pi / 2, 2.5])
+def test_covariances_lie_along_the_line_of_sight(bearing: float) -> None:
+    """A trunk is unsure in range as stated, and across it as stated, wherever it stands."""
+    fits = np.zeros((1, fit.OUT_SIZE))
+    fits[0, fit.AXIS_X + 2] = 1.0
+    fits[0, fit.RADIAL], fits[0, fit.TANGENTIAL] = 0.2, 0.01
+    line, side = np.array([np.cos(bearing), np.sin(bearing)]), np.array([-np.sin(bearing), np.cos(bearing)])
+    fits[0, fit.LINE_X], fits[0, fit.LINE_Y] = line
+    cov = fit.covariances(fits, np.array([[1.5, 2.0]]))[0, :2, :2]
+    assert np.sqrt(line @ cov @ line) == pytest.approx(0.3, rel=1e-3)
+    assert np.sqrt(side @ cov @ side) == pytest.approx(0.02, rel=1e-2)

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -187,6 +188,33 @@ def _clocks() -> None:
 
     for by in (-5.0, -0.5, 30.0, 3600.0):
         FAULTS[f"all clocks jump {by:+g} s half way"] = all_jump(by)
+
+    for kind in ("trunks", "odometry", "imu", "fix", "heading"):
+        for dt, what in ((18.0, "GPS without leap seconds"), (37.0, "TAI")):
+            FAULTS[f"{what} clock {kind}"] = each(
+                kind, lambda m, t, dt=dt: replace(m, stamp_ns=m.stamp_ns + int(dt * S))
+            )
+
+    def stall(kinds: tuple[str, ...], seconds: float) -> Fault:
+        def run(bag: Bag, rng: np.random.Generator) -> None:
+            late = bag.start_ns + int((30 + seconds) * S)
+            for n, e in enumerate(sorted(bag.events, key=lambda e: e.log_ns)):
+                if e.kind in kinds and bag.start_ns + 30 * S < e.log_ns < late:
+                    e.log_ns = late + 1000 * n
+
+        return run
+
+    for seconds in (3.0, 8.0):
+        FAULTS[f"recorder stalls for {seconds:g} s"] = stall(tuple(TOPICS), seconds)
+        FAULTS[f"GNSS link stalls for {seconds:g} s"] = stall(("fix", "heading"), seconds)
+
+    def host_set(bag: Bag, rng: np.random.Generator) -> None:
+        for e in bag.events:
+            if bag.at(e) > 30:
+                e.log_ns += 7200 * S
+        all_jump(7200.0)(bag, rng)
+
+    FAULTS["host clock set by 2 h, stamps and all"] = host_set
 
     @fault("uptime clock everywhere")
     def _(bag: Bag, rng: np.random.Generator) -> None:
@@ -387,6 +415,67 @@ def _wheels() -> None:
         "odometry", lambda m, t: replace(m, odom_T_child=np.array([1, 2, 0, 0, 0, 0, 1.0]), twist=np.zeros(6))
     )
     FAULTS["odometry backwards"] = moved(lambda p, t: p * [-1, -1, 1, 1, 1, 1, 1], lambda t: True)
+
+    def turning(by: float, alone: bool) -> Fault:
+        """Skid steering: the wheels overstate turns."""
+
+        def run(bag: Bag, rng: np.random.Generator) -> None:
+            mine = sorted(bag.of("odometry"), key=lambda e: e.it.stamp_ns)
+            T = np.array([_pose(e.it.odom_T_child) for e in mine])
+            now = T[0]
+            out = [now]
+            for a, b in pairwise(T):
+                step = inverse(a) @ b
+                turn = Rotation.from_matrix(step[:3, :3]).as_rotvec() * np.array([1, 1, by])
+                step[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+                now = now @ step
+                out.append(now)
+            for e, P in zip(mine, out, strict=True):
+                q = np.concatenate([P[:3, 3], Rotation.from_matrix(P[:3, :3]).as_quat()])
+                e.it = replace(e.it, odom_T_child=q, twist=e.it.twist * np.array([1, 1, 1, 1, 1, by]))
+            if alone:
+                bag.events = [e for e in bag.events if e.kind not in ("fix", "heading")]
+
+        return run
+
+    for by in (0.6, 1.8):
+        FAULTS[f"wheels' turns x {by}"] = turning(by, False)
+        FAULTS[f"wheels' turns x {by}, no GNSS"] = turning(by, True)
+
+    def dark(bag: Bag, rng: np.random.Generator) -> None:
+        bag.events = [
+            e for e in bag.events if e.kind not in ("fix", "heading") and not (e.kind == "imu" and 15 < bag.at(e) < 35)
+        ]
+
+    FAULTS["imu gap of 20 s, no GNSS"] = dark
+
+    def stands(bag: Bag, rng: np.random.Generator) -> None:
+        """Half a minute before the start, with noisy fixes at 10 Hz."""
+        pause = 30 * S
+        first = {k: min(bag.of(k), key=lambda e: e.it.stamp_ns).it for k in TOPICS}
+        for e in bag.events:
+            e.it = replace(e.it, stamp_ns=e.it.stamp_ns + pause)
+            e.log_ns += pause
+        t = bag.truth
+        bag.truth = replace(
+            t,
+            stamps_ns=np.concatenate([t.stamps_ns[:1], t.stamps_ns + pause]),
+            world_T_robot=np.concatenate([t.world_T_robot[:1], t.world_T_robot]),
+        )
+        for kind, hz in (("odometry", 20), ("imu", 100), ("fix", 10), ("heading", 5)):
+            for k in range(30 * hz):
+                ns = bag.start_ns + k * S // hz
+                m = replace(first[kind], stamp_ns=ns)
+                if kind == "imu":
+                    m = replace(m, gyro=m.gyro + rng.normal(0, 0.003, 3), accel=m.accel + rng.normal(0, 0.05, 3))
+                if kind == "fix":
+                    z = t.datum.to_enu(first[kind].lat_lon_h[None]) + rng.normal(0, [0.02, 0.02, 0.04])
+                    m = replace(m, lat_lon_h=t.datum.to_geodetic(z)[0], cov=4e-4 * np.diag([1, 1, 4.0]))
+                if kind == "odometry":
+                    m = replace(m, twist=0 * m.twist)
+                bag.events.append(Event(kind, ns + 3_000_000, m))
+
+    FAULTS["stands for half a minute"] = stands
 
     @fault("odometry reset half way")
     def _(bag: Bag, rng: np.random.Generator) -> None:

@@ -10,18 +10,21 @@ import pytest
 from test_estimate import problem
 
 from topograph.config import Config
+from topograph.estimate import Headings
+from topograph.estimate.ekf import filtered_path
 from topograph.estimate.inertia import inertia
 from topograph.evaluate import Metric, Truth, map_metrics
 from topograph.evaluate.localization import localization_errors
 from topograph.evaluate.metrics import match
-from topograph.geometry import Array, Datum, interpolate, inverse, planar, transform
+from topograph.geometry import Array, Datum, interpolate, inverse, planar, transform, wrap, yaw_of
 from topograph.motion import Inertial
-from topograph.pipeline import Solved, audited, baseline, localize_bags, read_run, solve_run, topo_map
+from topograph.pipeline import Solved, audited, baseline, localize_bags, map_T_scans, read_run, solve_run, topo_map
 from topograph.report.export import write
 from topograph.report.page import show
 from topograph.simulate import DESIGNS, DriveConfig, SensorConfig, record
 from topograph.simulate.detections import DetectionNoise
 from topograph.topomap import TopoMap
+from topograph.trees import shapes
 
 ORCHARD = replace(DESIGNS["grid"], rows=3, columns=5, multi_stem=0.0)
 
@@ -111,6 +114,15 @@ def test_wrong_fixes_do_not_bend_the_path_nor_tilt_the_trees(degraded: list[Mapp
         assert m.metrics["tree precision"] == m.metrics["tree recall"] == 1.0
 
 
+def test_axes_are_as_the_last_path_has_them(degraded: list[Mapped]) -> None:
+    """Feet are computed from axes; axes that an earlier, bent path gave would tilt them all."""
+    for m in degraded:
+        s = m.solved
+        d = s.detections
+        own = shapes(d, s.tree, map_T_scans(s), len(s.estimate.trees))
+        np.testing.assert_allclose(s.shapes.slope, own.slope, atol=1e-3)
+
+
 def test_clean_runs_are_called_sound_and_leave_nothing_out(rtk: list[Mapped]) -> None:
     for m in rtk:
         assert audited(m.solved).word == "sound", audited(m.solved).reasons
@@ -133,6 +145,20 @@ def test_the_thesis_is_neither_sabotaged_nor_flattered(rtk: list[Mapped]) -> Non
         theirs = {x.name: x.value for x in map_metrics(baseline(m.solved, Config())[1], m.truth)}
         assert theirs["tree recall"] > 0.9
         assert m.metrics["tree error mean"] < theirs["tree error mean"] < 0.075
+
+
+def test_the_thesis_filter_turns_with_the_antenna(rtk: list[Mapped]) -> None:
+    """Without a heading sensor its heading comes from fixes of an antenna beside the robot's middle: as robot_localization's does."""
+    for m in rtk[:2]:
+        p = m.solved.problem
+        none = np.zeros(0)
+        bare = replace(p, headings=Headings(np.zeros(0, np.int64), np.zeros((0, 3)), none, none))
+        path = filtered_path(bare, p.stamps_ns)
+        true = interpolate(m.truth.stamps_ns, m.truth.world_T_robot, p.stamps_ns)
+        late = p.stamps_ns > p.stamps_ns[0] + 10 * 10**9
+        off = np.abs(wrap(yaw_of(path) - yaw_of(true)))[late]
+        assert off.mean() < 0.02
+        assert off.max() < 0.06
 
 
 def test_rows_are_the_rows_that_were_planted(rtk: list[Mapped]) -> None:

@@ -166,6 +166,15 @@ class Clocks:
         recent = [o.product.stamp_ns - o.log_ns for o in s.odd[-AGREE:]]
         if len(recent) < AGREE or max(recent) - min(recent) > AGREE_NS:
             return
+        first = s.odd[-AGREE]
+        logged, stamped = m.log_ns - first.log_ns, stamp - first.product.stamp_ns
+        if abs(stamped - logged) > 0.5 * max(
+            logged, stamped
+        ):  # delivered at once: a backlog, overtaken by a newer message
+            held, s.odd = s.odd, []
+            s.last = stamp
+            yield from (self._moved(h, s.shift) for h in held)
+            return
         jump = int(median(recent)) - usual
         s.shift -= jump
         s.usual.clear()

@@ -63,7 +63,7 @@ def merge(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64], config: To
         datum=old.datum,
         ids=ids.astype(np.int64),
         p=p,
-        cov=both("cov"),
+        cov=_surer(old, new, tree_of_old, both("cov")),
         axis=both("axis"),
         diameter=both("diameter"),
         first_branch=both("first_branch"),
@@ -81,6 +81,17 @@ def merge(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64], config: To
         datum_cov=old.datum_cov,
         meta=new.meta,
     )
+
+
+def _surer(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64], cov: Array) -> Array:
+    """Covariances (T, 3, 3) where a tree seen again is at least as sure as it was: what a tree's shape adds to its place is added to
+    each run's anew, though it is the same tree.
+    """
+    out = cov.copy()
+    for i in np.flatnonzero(tree_of_old >= 0).tolist():
+        if np.trace(old.cov[i][:2, :2]) < np.trace(new.cov[tree_of_old[i]][:2, :2]):
+            out[i] = old.cov[i]
+    return out
 
 
 def _told_better(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from topograph.estimate.initial import initial_path, moves_enough, yaw_of_direction
 from topograph.estimate.problem import EstimateConfig, Fixes, Headings, Problem
@@ -67,31 +68,44 @@ def assemble(
     if len(fixes.keyframe) < LEAST_FIXES:  # they hold neither the heading nor, with the antenna's lever, the place
         fixes, datum = no_fixes(), None
     headings = _headings(keyframes_ns, odom, motion, streams, robot_T_baseline, datum)
-    up, up_sigma = _mean_axes(keyframes_ns, detections)
+    up, up_sigma = _mean_axes(keyframes_ns, odom, detections)
     return Problem(
         keyframes_ns, odom, motion.sigma(motion_config, keyframes_ns), motion, motion_config, inertial, fixes, headings,
         datum, detections, empty_sightings(), 0, up=up, up_sigma=up_sigma,
     )  # fmt: skip
 
 
-def _mean_axes(keyframes_ns: Stamps, detections: Detections, least: int = 10, lean: float = 0.1) -> tuple[Array, Array]:
-    """Mean trunk axis (K, 3) at each keyframe and its deviation (K,): trees grow upwards, within their lean.
+SEEN_FROM = 8.0
+"""Keyframes nearer together than this see mostly the same trees, m."""
+LEAST_LEAN = 0.02
+"""Trees that all seem upright may still lean together, rad."""
 
-    NaN with fewer than `least` trunks, and everywhere when the axes are not measured (all alike).
+
+def _mean_axes(keyframes_ns: Stamps, odom: Array, detections: Detections, least: int = 10) -> tuple[Array, Array]:
+    """Mean trunk axis (K, 3) at each keyframe and its deviation (K,): trees grow upwards, within the lean that they show.
+
+    Keyframes that see the same trees err alike, so that each counts for as much less as there are of them. NaN with fewer
+    than `least` trunks, and everywhere when the axes are not measured (all alike).
     """
     n = len(keyframes_ns)
     up, sigma = np.full((n, 3), np.nan), np.full(n, np.nan)
     if not len(detections) or detections.axis[:, :2].std() < 1e-3:
         return up, sigma
-    keyframe = nearest_keyframe(detections.stamps_ns, keyframes_ns)[detections.scan]
+    scan_keyframe = nearest_keyframe(detections.stamps_ns, keyframes_ns)
+    keyframe = scan_keyframe[detections.scan]
+    scans = np.maximum(np.bincount(scan_keyframe, minlength=n), 1)
     order = np.argsort(keyframe, kind="stable")
     ends = np.searchsorted(keyframe[order], np.arange(n + 1))
+    tree = cKDTree(odom[:, :2, 3])
+    alike = np.asarray(tree.query_ball_point(odom[:, :2, 3], SEEN_FROM, return_length=True), float)
     for k in range(n):
         mine = order[ends[k] : ends[k + 1]]
-        if len(mine) >= least:
+        trees = len(mine) / scans[k]  # scans of one keyframe see the same trees as well
+        if trees >= 0.5 * least and len(mine) >= least:
             mean = np.median(detections.axis[mine], axis=0)
             up[k] = mean / np.linalg.norm(mean)
-            sigma[k] = np.hypot(0.012, lean / np.sqrt(len(mine)))
+            lean = 1.4826 * float(np.median(np.abs(detections.axis[mine, :2] - mean[:2])))
+            sigma[k] = max(lean, LEAST_LEAN) / np.sqrt(trees) * np.sqrt(alike[k])
     return up, sigma
 
 

@@ -343,3 +343,13 @@ def test_turns_within_a_gap_of_the_imu_are_the_wheels() -> None:
     at = T0 + np.array([10, 12, 20, 22]) * 10**9
     sigma = motion.sigma(MotionConfig(), at)[:, 2]
     assert sigma[2] > 2 * sigma[0]
+
+
+@pytest.mark.parametrize("scale", [0.9, 1.0, 1.1])
+def test_scale_of_the_gyro_is_learnt_from_the_heading(scale: float) -> None:
+    streams, _ = drive(18)
+    inertial, _, notes = align_imu(replace(streams, gyro=scale * streams.gyro), np.eye(4))
+    assert inertial is not None
+    assert bool(notes) == (scale != 1.0)
+    turned = float(inertial.gyro[:, 2] @ streams.gyro[:, 2] / (streams.gyro[:, 2] @ streams.gyro[:, 2]))
+    assert turned == pytest.approx(1.0, abs=0.015)

@@ -198,25 +198,25 @@ def compare(
 
     config = config_of(config_file, words)
     true = truth_of(truth)
-    with progress_bar(quiet) as progress:
-        run = pipeline.read_run(bags, config, progress)
-        solved = pipeline.solve_run(run, config, progress=progress)
-        ours = pipeline.topo_map(solved, config, {})
-        estimate, theirs = pipeline.baseline(solved, config)
-    rows: dict[str, list[Any]] = {}
-    errors = {}
-    for name, topo, e in (("graph", ours, solved.estimate), ("thesis", theirs, estimate)):
-        metrics = [doubles(topo)]
-        if true is not None:
-            metrics = truth_metrics(topo, e.stamps_ns, e.map_T_robot, true)
-            errors[name] = np.linalg.norm(tree_errors(topo, true)[2][:, :2], axis=1)
-        rows[name] = [*metrics, replace(metrics[0], name="seconds", value=e.seconds, unit="s")]
-    click.echo(f"{'':<34} {'graph':>12} {'thesis':>12}")
-    theirs_by_name = {m.name: m for m in rows["thesis"]}
-    for m in rows["graph"]:
-        other = theirs_by_name.get(m.name)
-        click.echo(f"{m.name:<34} {show(m):>12} {show(other) if other else '–':>12}")
     with results_folder(results) as folder:
+        with progress_bar(quiet) as progress:
+            run = pipeline.read_run(bags, config, progress)
+            solved = pipeline.solve_run(run, config, progress=progress)
+            ours = pipeline.topo_map(solved, config, {})
+            estimate, theirs = pipeline.baseline(solved, config)
+        rows: dict[str, list[Any]] = {}
+        errors = {}
+        for name, topo, e in (("graph", ours, solved.estimate), ("thesis", theirs, estimate)):
+            metrics = [doubles(topo)]
+            if true is not None:
+                metrics = truth_metrics(topo, e.stamps_ns, e.map_T_robot, true)
+                errors[name] = np.linalg.norm(tree_errors(topo, true)[2][:, :2], axis=1)
+            rows[name] = [*metrics, replace(metrics[0], name="seconds", value=e.seconds, unit="s")]
+        click.echo(f"{'':<34} {'graph':>12} {'thesis':>12}")
+        theirs_by_name = {m.name: m for m in rows["thesis"]}
+        for m in rows["graph"]:
+            other = theirs_by_name.get(m.name)
+            click.echo(f"{m.name:<34} {show(m):>12} {show(other) if other else '–':>12}")
         if errors:
             (folder / "comparison.png").write_bytes(report.comparison_figure(errors))
         flat = [replace(m, name=f"{k}: {m.name}") for k, ms in rows.items() for m in ms]

@@ -61,24 +61,26 @@ def localize(
     topo = store.load(map_file, clouds=method != "graph")
     if true is not None and topo.datum is None:
         raise UsageError("--truth needs a georeferenced map: without a datum the two frames have nothing in common")
-    with progress_bar(quiet) as progress:
-        first = "thesis" if method == "thesis" else "graph"
-        run = pipeline.localize_bags(topo, bags, config, first, progress, (from_s, to_s))
-        other = None
-        if method == "both":
-            other = pipeline.localize_bags(topo, bags, config, "thesis", progress, (from_s, to_s))
-    errors = None if true is None or topo.datum is None else localization_errors(run.reports, true, topo.datum)
-    metrics = localization_metrics(run.reports, run.distance, run.update_ms, errors)
-    by_method = {} if errors is None else {first: errors}
-    if other is not None:
-        theirs = None if true is None or topo.datum is None else localization_errors(other.reports, true, topo.datum)
-        by_method |= {} if theirs is None else {"thesis": theirs}
-        found = localization_metrics(other.reports, other.distance, other.update_ms, theirs)
-        metrics += [replace(m, name=f"thesis: {m.name}") for m in found]
-        run.exploded = other.exploded
-    fixes = run.fixes
-    poses = np.array([f.map_T_robot for f in fixes]).reshape(-1, 4, 4)
     with results_folder(results) as folder:
+        with progress_bar(quiet) as progress:
+            first = "thesis" if method == "thesis" else "graph"
+            run = pipeline.localize_bags(topo, bags, config, first, progress, (from_s, to_s))
+            other = None
+            if method == "both":
+                other = pipeline.localize_bags(topo, bags, config, "thesis", progress, (from_s, to_s))
+        errors = None if true is None or topo.datum is None else localization_errors(run.reports, true, topo.datum)
+        metrics = localization_metrics(run.reports, run.distance, run.update_ms, errors)
+        by_method = {} if errors is None else {first: errors}
+        if other is not None:
+            theirs = (
+                None if true is None or topo.datum is None else localization_errors(other.reports, true, topo.datum)
+            )
+            by_method |= {} if theirs is None else {"thesis": theirs}
+            found = localization_metrics(other.reports, other.distance, other.update_ms, theirs)
+            metrics += [replace(m, name=f"thesis: {m.name}") for m in found]
+            run.exploded = other.exploded
+        fixes = run.fixes
+        poses = np.array([f.map_T_robot for f in fixes]).reshape(-1, 4, 4)
         write_tum(folder / "localization.tum", np.array([f.stamp_ns for f in fixes], np.int64), poses)
         write_tum(folder / "smoothed.tum", *run.smoothed)
         write_text(folder / "localization.csv", _csv(run.reports))

@@ -37,6 +37,9 @@ class Inertial:
 
 UPSIDE = 0.6
 """Gravity further from the base's vertical than this, rad, is not a slope but a wrong mounting."""
+SCALE, SCALES, TOLD = 0.04, (0.75, 1.33), 0.98
+"""A gyro's scale that is off by more is corrected, within these, where its rates and the heading's correlate so well (clean: within
+0.01 of 1, correlation from 0.994 on)."""
 OUTSIDE = (0.5, 1.7)
 """Slope of a sound gyro on heading or course, whose rates are smoothed."""
 LATE = 0.15
@@ -79,6 +82,11 @@ def align_imu(streams: Streams, robot_T_imu: Array | None) -> tuple[Inertial | N
                 f"gravity is {np.degrees(tilt):.0f}° from where the IMU's mounting puts it: the IMU is left out (mend its transform, or its axes: z is up)"
             ],
         )
+    by = _gyro_scale(streams, gyro)
+    if by != 1.0:
+        notes.append(f"the gyro turns by {by:.2f} of what the heading receiver does: corrected (calibrate it)")
+        streams = replace(streams, gyro=streams.gyro / by)
+        gyro = gyro / by
     streams, said, usable = _against_wheels(streams, gyro)
     notes += said
     if not usable:
@@ -91,6 +99,17 @@ def align_imu(streams: Streams, robot_T_imu: Array | None) -> tuple[Inertial | N
         max(_white(gyro) * root, 1e-4), max(_white(accel) * root, 2e-3),
     )  # fmt: skip
     return inertial, streams, notes
+
+
+def _gyro_scale(streams: Streams, gyro: Array) -> float:
+    """What the gyro overstates turns by, where a heading receiver tells it surely; else 1."""
+    if len(streams.heading_ns) < 100:
+        return 1.0
+    outside = outside_rate(streams)
+    found = None if outside is None else compare(streams.imu_ns, gyro[:, 2], *outside)
+    if found is None or found.correlation < TOLD or not SCALES[0] < found.slope < SCALES[1] or abs(found.lag) > LATE:
+        return 1.0
+    return found.slope if abs(found.slope - 1.0) > SCALE else 1.0
 
 
 def _against_wheels(streams: Streams, gyro: Array) -> tuple[Streams, list[str], bool]:

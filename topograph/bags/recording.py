@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any, Self, cast
 
 import numpy as np
+from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_typestore
@@ -192,7 +193,7 @@ class Recording:
                 return self._finite_imu(decode.unpack_imu(raw, reader.is2))
             if kind == "odometry":
                 odometry = decode.unpack_odometry(raw, reader.is2)
-                if not np.isfinite(odometry.odom_T_child).all() or not odometry.odom_T_child[3:].any():
+                if not _sane(odometry.odom_T_child) or not _sane(odometry.twist) or not odometry.odom_T_child[3:].any():
                     self._count("odometry: not finite")
                     return None
                 return odometry
@@ -220,10 +221,15 @@ class Recording:
             del self.skipped[reason]
 
     def _finite_imu(self, imu: Imu) -> Imu | None:
-        if np.isfinite(imu.gyro).all() and np.isfinite(imu.accel).all():
+        if _sane(imu.gyro) and _sane(imu.accel):
             return imu
         self._count("imu: not finite")
         return None
+
+
+def _sane(values: NDArray[np.float64]) -> bool:
+    """Finite, and of a size that something on Earth may have in SI units."""
+    return bool(np.isfinite(values).all() and np.abs(values).max() < 1e9)
 
 
 def _resolve(path: Path) -> Path:

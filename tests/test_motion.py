@@ -353,3 +353,28 @@ def test_scale_of_the_gyro_is_learnt_from_the_heading(scale: float) -> None:
     assert bool(notes) == (scale != 1.0)
     turned = float(inertial.gyro[:, 2] @ streams.gyro[:, 2] / (streams.gyro[:, 2] @ streams.gyro[:, 2]))
     assert turned == pytest.approx(1.0, abs=0.015)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6])
+def test_fixes_that_jump_about_tell_nothing_of_the_wheels(share: float) -> None:
+    streams, _ = drive(19)
+    rng = np.random.default_rng(1)
+    enu = DATUM.to_enu(streams.lat_lon_h) + 5.0 * rng.normal(size=(len(streams.fix_ns), 3)) * (
+        rng.random((len(streams.fix_ns), 1)) < share
+    )
+    motion = dead_reckon(replace(streams, lat_lon_h=DATUM.to_geodetic(enu)), None, np.eye(4), MotionConfig(), LEVER)
+    assert motion is not None
+    assert motion.wheel_scale == 1.0
+    sound = dead_reckon(streams, None, np.eye(4), MotionConfig(), LEVER)
+    assert sound is not None
+    assert motion.distance[-1] == pytest.approx(sound.distance[-1], rel=0.02)
+
+
+def test_a_frozen_receiver_is_counted() -> None:
+    b = StreamsBuilder()
+    for k in range(60):
+        at = np.array([40.0 + 1e-6 * min(k, 20), -8.0, 100.0])
+        b.add(Fix(T0 + k * 10**8, "gnss", at, 1e-4 * np.eye(3), 2))
+    skipped: Counter[str] = Counter()
+    assert len(b.build(skipped).fix_ns) == 21
+    assert skipped == Counter({"fix: position repeated (frozen)": 39})

@@ -65,7 +65,7 @@ class StreamsBuilder:
         """Arrays in time order; repeated stamps and unusable fixes are dropped and counted."""
         odometry = _in_order(self.odometry, "odometry", skipped)
         imu = _in_order(self.imu, "imu", skipped)
-        fixes = [f for f in map(_flat, _in_order(self.fixes, "fix", skipped)) if _usable(f, skipped)]
+        fixes = _moving([f for f in map(_flat, _in_order(self.fixes, "fix", skipped)) if _usable(f, skipped)], skipped)
         headings = _in_order(self.headings, "heading", skipped)
         pose = np.array([o.odom_T_child for o in odometry]).reshape(-1, 7)
         frames = {
@@ -120,6 +120,26 @@ def _flat(f: Fix) -> Fix:
     cov = np.zeros((3, 3))
     cov[:2, :2], cov[2, 2] = f.cov[:2, :2], NO_HEIGHT
     return replace(f, lat_lon_h=np.array([*f.lat_lon_h[:2], 0.0]), cov=cov)
+
+
+FROZEN = 8
+"""So many fixes in a row at one place to the last bit are a receiver that repeats itself."""
+
+
+def _moving(fixes: list[Fix], skipped: Counter[str]) -> list[Fix]:
+    """Fixes without repetitions of a receiver that froze; the first of them stays."""
+    out: list[Fix] = []
+    run: list[Fix] = []
+    for f in [*fixes, None]:
+        if run and (f is None or not np.array_equal(f.lat_lon_h, run[0].lat_lon_h)):
+            keep = run[:1] if len(run) >= FROZEN else run
+            if len(run) > len(keep):
+                skipped["fix: position repeated (frozen)"] += len(run) - len(keep)
+            out += keep
+            run = []
+        if f is not None:
+            run.append(f)
+    return out
 
 
 def _usable(f: Fix, skipped: Counter[str]) -> bool:

@@ -22,11 +22,15 @@ SLIP = (0.12, 0.14)
 below that are for the graph, where the trunks speak too."""
 FASTEST = 12.0
 """A field robot's or tractor's speed, m/s; faster fixes are jumps."""
+CALM = 0.2
+"""Steps of fixes whose speeds scatter by more, m/s and beyond their noise, are jumps."""
 SURE = 5.0
 """Deviations by which the way between two fixes has to differ from the wheels'."""
 SCALE_WINDOW_S = 3.0
 SCALE = 0.03
 """Wheels whose scale is off by more are corrected; by less is what the graph's noise allows for."""
+CLEAR = 0.15
+"""Windows that scatter by more are of fixes that jump, and tell nothing of the wheels."""
 LEAST_WINDOWS = 15
 SLIP_SIGMA = 0.3
 """Share of the difference that is not known after the fixes' speed has been put in its place."""
@@ -93,6 +97,8 @@ def against_fixes(streams: Streams, odom_T_robot: Array, robot_p_antenna: Array)
     )  # of noise alone
     middle = np.sqrt(np.maximum(np.median(speed[rows], axis=1) ** 2 - still**2, 0.0))
     slipping &= np.abs(middle - scale * np.mean(wheel[rows], axis=1)) > 0.5 * apart / seconds
+    scatter = 1.4826 * np.median(np.abs(speed[rows] - np.median(speed[rows], axis=1)[:, None]), axis=1)
+    slipping &= scatter < CALM + 3.0 * still
     slipping &= (
         (np.abs(middle * seconds - way) < 0.5 * apart + 3.0 * noise) & (middle < FASTEST) & (seconds < 2.0 * LONGEST_S)
     )
@@ -138,7 +144,7 @@ def _scale(at: Stamps, enu: Array, antenna: Array, sigma: Array) -> float:
     ratio = (a / np.maximum(b, 1e-9))[far]
     middle = float(np.median(ratio))
     spread = 1.4826 * float(np.median(np.abs(ratio - middle)))
-    return middle if abs(middle - 1.0) > max(SCALE, spread) and 0.2 < middle < 5.0 else 1.0
+    return middle if abs(middle - 1.0) > max(SCALE, spread) and spread < CLEAR and 0.2 < middle < 5.0 else 1.0
 
 
 def _lasting(slipping: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 
 from topograph.audit.verdict import Finding
 from topograph.estimate import Estimate, Problem
-from topograph.estimate.initial import yaw_of_direction
-from topograph.geometry import Array, inverse, transform, wrap
+from topograph.estimate.initial import heading_misfit
+from topograph.geometry import Array, inverse, transform
 from topograph.motion import Motion, Streams
 
 SURE = 25.0
@@ -124,6 +124,7 @@ def standing(streams: Streams, motion: Motion) -> Iterator[Finding]:
         return
     v = np.diff(motion.distance) / np.maximum(np.diff(motion.stamps_ns) * 1e-9, 1e-3)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], (v < 0.01).astype(int), [0]]))).reshape(-1, 2)
+    enu = streams.fixes_enu()[:, :2]
     worst, when, most = 0.0, 0.0, DRIFT[0]
     for a, b in edges.tolist():
         begin, end = motion.stamps_ns[a], motion.stamps_ns[min(b, len(motion.stamps_ns) - 1)]
@@ -135,10 +136,8 @@ def standing(streams: Streams, motion: Motion) -> Iterator[Finding]:
         if j - i < 6:
             continue
         sigma = float(np.sqrt(np.median(streams.fix_cov[i:j, 0, 0])))
-        g = streams.lat_lon_h[i:j]
-        enu = (g[:, :2] - g[0, :2]) * 111_320.0 * np.array([1.0, np.cos(np.radians(g[0, 0]))])
-        n = max(2, len(enu) // 3)
-        moved = float(np.linalg.norm(np.median(enu[-n:], axis=0) - np.median(enu[:n], axis=0)))
+        n = max(2, int(j - i) // 3)
+        moved = float(np.linalg.norm(np.median(enu[j - n : j], axis=0) - np.median(enu[i : i + n], axis=0)))
         # Neighbours in time err alike: a stand holds as many independent fixes as it lasts time constants.
         free = max(1.0, (end - begin) * 1e-9 / 3.0 / ALIKE_S)
         bound = max(DRIFT[0], DRIFT[1] * max(sigma, 0.005) / np.sqrt(free))
@@ -156,9 +155,7 @@ def headings(problem: Problem, estimate: Estimate) -> Iterator[Finding]:
     h = problem.headings
     if len(h.keyframe) < 10:
         return
-    off = wrap(yaw_of_direction(estimate.map_T_robot[h.keyframe], h.direction) - h.yaw)
-    middle = float(np.angle(np.mean(np.exp(1j * off))))
-    size = float(np.median(np.abs(off)))
+    middle, size = heading_misfit(problem, estimate.map_T_robot)
     if size > HEADING:
         yield Finding(
             name="heading", value=size, bound=HEADING, unit="rad",

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from statistics import median
 from typing import Protocol
 
@@ -76,25 +76,16 @@ class Clocks:
 
     def pass_on(self, messages: Iterable[Message]) -> Iterator[Message]:
         """The messages with stamps of one clock, in the order of recording; the rest is counted."""
-        waiting: list[Message] = []
-        started = False
-        for m in messages:
-            if not started:
-                self._begin_ns = self._begin_ns or m.log_ns
-                waiting.append(m)
-                if m.log_ns - self._begin_ns < BUFFER_NS:
-                    continue
-                started = True
-                self._start(waiting)
-                for w in waiting:
-                    yield from self._take(w)
-                waiting = []
-                continue
+        source = iter(messages)
+        first: list[Message] = []
+        for m in source:
+            self._begin_ns = self._begin_ns or m.log_ns
+            first.append(m)
+            if m.log_ns - self._begin_ns >= BUFFER_NS:
+                break
+        self._start(first)
+        for m in chain(first, source):
             yield from self._take(m)
-        if not started:
-            self._start(waiting)
-            for w in waiting:
-                yield from self._take(w)
         for kind, s in self._streams.items():
             self._drop(kind, s)
 
@@ -168,9 +159,8 @@ class Clocks:
             return
         first = s.odd[-AGREE]
         logged, stamped = m.log_ns - first.log_ns, stamp - first.product.stamp_ns
-        if abs(stamped - logged) > 0.5 * max(
-            logged, stamped
-        ):  # delivered at once: a backlog, overtaken by a newer message
+        # Delivered at once: a backlog, overtaken by a newer message.
+        if abs(stamped - logged) > 0.5 * max(logged, stamped):
             held, s.odd = s.odd, []
             s.last = stamp
             yield from (self._moved(h, s.shift) for h in held)

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from topograph.estimate.initial import initial_path, moves_enough, yaw_of_direction
+from topograph.estimate.initial import heading_misfit, initial_path, moves_enough
 from topograph.estimate.problem import EstimateConfig, Fixes, Headings, Problem
-from topograph.geometry import Array, Datum, Stamps, inverse, transform, wrap
+from topograph.geometry import Array, Datum, Stamps, inverse, transform
 from topograph.motion import Inertial, Motion, MotionConfig, Streams
 from topograph.trees import Detections, Sightings
 from topograph.trees.sightings import DELAY_NS, nearest_keyframe
@@ -201,15 +201,12 @@ def without_wrong_headings(problem: Problem) -> tuple[Problem, list[str]]:
     # Without a gyro the path laid onto the fixes turns as the wheels do, and who is wrong is not for the wheels to say.
     if len(h.keyframe) < 10 or not problem.motion.gyro or not moves_enough(problem):
         return problem, []
-    path = initial_path(problem)
-    off = wrap(yaw_of_direction(path[h.keyframe], h.direction) - h.yaw)
-    size = float(np.median(np.abs(off)))
+    middle, size = heading_misfit(problem, initial_path(problem))
     if size < WRONG_HEADING:
         return problem, []
     none = np.zeros(0)
-    middle = np.degrees(float(np.angle(np.mean(np.exp(1j * off)))))
     note = (
-        f"headings are {middle:+.0f}° from the course that fixes and wheels take (median {np.degrees(size):.0f}°): they are left out "
+        f"headings are {np.degrees(middle):+.0f}° from the course that fixes and wheels take (median {np.degrees(size):.0f}°): they are left out "
         "(check the baseline's frame, the receiver's clock, and that azimuth is counted from east)"
     )
     return replace(problem, headings=Headings(np.zeros(0, np.int64), np.zeros((0, 3)), none, none)), [note]

@@ -161,23 +161,24 @@ def orthonormal(poses: Array) -> Array:
     return out
 
 
-def factors_of(problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | None) -> Iterator[tuple[str, Any]]:
-    """Every factor of the problem once, with its kind: "motion", "odometry", "imu", "fix", "link", "heading", "trunk", "tree"."""
-    yield from _motion(problem, inert)
-    for f in _fixes(problem, p):
-        yield "fix", f
-    if problem.link is not None:
-        sigma = [0.1, 0.1, 0.02, 0.2, 0.2, 0.5]
-        yield "link", factors.odometry(X + problem.link.a, X + problem.link.b, orthonormal(problem.link.a_T_b), sigma)
-    h = problem.headings
-    for k, direction, yaw, sigma in zip(h.keyframe.tolist(), h.direction, h.yaw, h.sigma, strict=True):
-        least = max(float(sigma), config.heading_floor)
-        yield "heading", factors.heading(X + k, float(yaw), direction, least, Kernel("huber", 1.345))
-    s = problem.sightings
-    for f in factors.trunks((X + s.keyframe).tolist(), (L + s.tree).tolist(), s.p, p.trunk_scale**2 * s.cov, p.trunk):
-        yield "trunk", f
-    for f in _tree_priors(problem):
-        yield "tree", f
+def factors_of(
+    problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | None, *, without: Container[str] = ()
+) -> Iterator[tuple[str, Any]]:
+    """Every factor of the problem once, with its kind: "motion", "odometry", "imu", "fix", "link", "heading", "trunk", "tree".
+
+    Kinds in `without` are left out, and not built.
+    """
+    yield from ((kind, f) for kind, f in _motion(problem, inert) if kind not in without)
+    parts = (
+        ("fix", _fixes(problem, p)),
+        ("link", _links(problem)),
+        ("heading", _headings(problem, config)),
+        ("trunk", _trunks(problem, p)),
+        ("tree", _tree_priors(problem)),
+    )
+    for kind, part in parts:  # generators: what is left out has not begun
+        if kind not in without:
+            yield from ((kind, f) for f in part)
 
 
 def graph_of(
@@ -185,10 +186,28 @@ def graph_of(
 ) -> Any:
     """A NonlinearFactorGraph of the factors whose kind is not in `without`."""
     g = gtsam.NonlinearFactorGraph()
-    for kind, f in factors_of(problem, p, config, inert):
-        if kind not in without:
-            g.add(f)
+    for _, f in factors_of(problem, p, config, inert, without=without):
+        g.add(f)
     return g
+
+
+def _links(problem: Problem) -> Iterator[Any]:
+    if problem.link is not None:
+        sigma = [0.1, 0.1, 0.02, 0.2, 0.2, 0.5]
+        yield factors.odometry(X + problem.link.a, X + problem.link.b, orthonormal(problem.link.a_T_b), sigma)
+
+
+def _headings(problem: Problem, config: EstimateConfig) -> Iterator[Any]:
+    h = problem.headings
+    for k, direction, yaw, sigma in zip(h.keyframe.tolist(), h.direction, h.yaw, h.sigma, strict=True):
+        least = max(float(sigma), config.heading_floor)
+        yield factors.heading(X + k, float(yaw), direction, least, Kernel("huber", 1.345))
+
+
+def _trunks(problem: Problem, p: Pass) -> Iterator[Any]:
+    s = problem.sightings
+    keys = (X + s.keyframe).tolist(), (L + s.tree).tolist()
+    yield from factors.trunks(*keys, s.p, p.trunk_scale**2 * s.cov, p.trunk)
 
 
 def _tree_priors(problem: Problem) -> Iterator[Any]:

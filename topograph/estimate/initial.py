@@ -96,3 +96,10 @@ def yaw_of_direction(pose: Array, direction: Array) -> Array:
     """Azimuth (N,) in rad of body directions (N, 3) under poses (N, 4, 4)."""
     d = (pose[:, :3, :3] @ direction[:, :, None])[..., 0]
     return np.asarray(np.arctan2(d[:, 1], d[:, 0])) if len(d) else yaw_of(pose)
+
+
+def heading_misfit(problem: Problem, poses: Array) -> tuple[float, float]:
+    """Mean difference of the headings from poses (K, 4, 4), rad, and the median of its size."""
+    h = problem.headings
+    off = wrap(yaw_of_direction(poses[h.keyframe], h.direction) - h.yaw)
+    return float(np.angle(np.mean(np.exp(1j * off)))), float(np.median(np.abs(off)))

@@ -10,7 +10,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.spatial.transform import Rotation
 
 from topograph.geometry import Array, Stamps, se3, yaw_of
-from topograph.motion.rates import ALIKE, compare, outside_rate, wheel_rate
+from topograph.motion.rates import ALIKE, Agreement, compare, outside_rate, wheel_rate
 from topograph.motion.streams import Streams
 
 GRAVITY = 9.80665
@@ -82,12 +82,15 @@ def align_imu(streams: Streams, robot_T_imu: Array | None) -> tuple[Inertial | N
                 f"gravity is {np.degrees(tilt):.0f}° from where the IMU's mounting puts it: the IMU is left out (mend its transform, or its axes: z is up)"
             ],
         )
-    by = _gyro_scale(streams, gyro)
-    if by != 1.0:
+    outside = outside_rate(streams)
+    by_outside = None if outside is None else compare(streams.imu_ns, gyro[:, 2], *outside)
+    by = _gyro_scale(streams, by_outside)
+    if by_outside is not None and by != 1.0:
         notes.append(f"the gyro turns by {by:.2f} of what the heading receiver does: corrected (calibrate it)")
         streams = replace(streams, gyro=streams.gyro / by)
         gyro = gyro / by
-    streams, said, usable = _against_wheels(streams, gyro)
+        by_outside = replace(by_outside, slope=by_outside.slope / by)
+    streams, said, usable = _against_wheels(streams, gyro, by_outside)
     notes += said
     if not usable:
         return None, streams, notes
@@ -101,18 +104,16 @@ def align_imu(streams: Streams, robot_T_imu: Array | None) -> tuple[Inertial | N
     return inertial, streams, notes
 
 
-def _gyro_scale(streams: Streams, gyro: Array) -> float:
-    """What the gyro overstates turns by, where a heading receiver tells it surely; else 1."""
-    if len(streams.heading_ns) < 100:
+def _gyro_scale(streams: Streams, found: Agreement | None) -> float:
+    """What the gyro overstates turns by, where a heading receiver tells it surely; else 1. `found`: gyro against outside rates."""
+    if found is None or len(streams.heading_ns) < 100:
         return 1.0
-    outside = outside_rate(streams)
-    found = None if outside is None else compare(streams.imu_ns, gyro[:, 2], *outside)
-    if found is None or found.correlation < TOLD or not SCALES[0] < found.slope < SCALES[1] or abs(found.lag) > LATE:
+    if found.correlation < TOLD or not SCALES[0] < found.slope < SCALES[1] or abs(found.lag) > LATE:
         return 1.0
     return found.slope if abs(found.slope - 1.0) > SCALE else 1.0
 
 
-def _against_wheels(streams: Streams, gyro: Array) -> tuple[Streams, list[str], bool]:
+def _against_wheels(streams: Streams, gyro: Array, by_outside: Agreement | None) -> tuple[Streams, list[str], bool]:
     """Streams with gyro's or wheels' clock set right, what to say, and whether the gyro can be used.
 
     Which of the two is wrong is for a third to say: the heading, or the course of good fixes. Without one, clocks stay.
@@ -122,8 +123,6 @@ def _against_wheels(streams: Streams, gyro: Array) -> tuple[Streams, list[str], 
     by_wheels = compare(streams.imu_ns, gyro[:, 2], *wheel_rate(streams))
     if by_wheels is None:
         return streams, [], True
-    outside = outside_rate(streams)
-    by_outside = compare(streams.imu_ns, gyro[:, 2], *outside) if outside is not None else None
     if by_outside is not None and by_outside.correlation > ALIKE and not OUTSIDE[0] < by_outside.slope < OUTSIDE[1]:
         return streams, [
             f"the gyro turns by {by_outside.slope:.2f} of what the heading does: the IMU is left out (check its units)"

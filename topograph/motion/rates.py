@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from topograph.geometry import Array, Datum, Stamps, wrap, yaw_of
+from topograph.geometry import Array, Stamps, wrap, yaw_of
 from topograph.motion.streams import Streams
 from topograph.motion.wheels import GOOD_FIX
 
@@ -148,13 +148,10 @@ def outside_rate(streams: Streams) -> tuple[Stamps, Array] | None:
 
 def _course(streams: Streams) -> tuple[Stamps, Array]:
     """Direction of travel between good fixes half a metre apart, at their middle."""
-    good = (
-        np.sqrt(streams.fix_cov[:, [0, 1], [0, 1]].max(axis=1)) < GOOD_FIX if len(streams.fix_ns) else np.zeros(0, bool)
-    )
+    good = streams.fix_sigma() < GOOD_FIX
     if good.sum() < 20:
         return np.zeros(0, np.int64), np.zeros(0)
-    g, ns = streams.lat_lon_h[good], streams.fix_ns[good]
-    enu = Datum(*(float(v) for v in np.median(g, axis=0))).to_enu(g)[:, :2]
+    ns, enu = streams.fix_ns[good], streams.fixes_enu()[good, :2]
     stamps, course = [], []
     a = 0
     for b in range(1, len(enu)):

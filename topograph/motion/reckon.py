@@ -10,7 +10,6 @@ from scipy.ndimage import gaussian_filter1d
 
 from topograph.geometry import (
     Array,
-    Datum,
     Stamps,
     exp,
     from_quaternion,
@@ -151,8 +150,7 @@ def _stands_still(streams: Streams, step: Array) -> bool:
     """Wheels that stand while good fixes travel."""
     if len(streams.fix_ns) < 10 or float(np.linalg.norm(step[:, :3, 3], axis=1).sum()) > STANDS[0]:
         return False
-    lat, lon, h = (float(v) for v in np.median(streams.lat_lon_h, axis=0))
-    enu = Datum(lat, lon, h).to_enu(streams.lat_lon_h)[:, :2]
+    enu = streams.fixes_enu()[:, :2]
     reach = np.percentile(np.linalg.norm(enu - np.median(enu, axis=0), axis=1), 90)
     return bool(reach > STANDS[1])
 
@@ -231,15 +229,14 @@ def _over_gaps(imu_ns: Stamps, R: Array, odometry_ns: Stamps, turn: Array) -> tu
 
 def _turned(yaw: Array) -> Array:
     """Rotations (K, 3, 3) about the vertical."""
-    return np.asarray(planar(np.zeros(len(yaw)), np.zeros(len(yaw)), yaw)[:, :3, :3])
+    return np.asarray(planar(0.0, 0.0, yaw)[:, :3, :3])
 
 
 def _from_fixes(streams: Streams, inertial: Inertial | None, config: MotionConfig) -> Motion | None:
     """Without wheels: the fixes, smoothed, say where the robot was; the gyro, or the course, which way it looked."""
     if len(streams.fix_ns) < 10:
         return None
-    lat, lon, h = (float(v) for v in np.median(streams.lat_lon_h, axis=0))
-    enu = gaussian_filter1d(Datum(lat, lon, h).to_enu(streams.lat_lon_h), 1.5, axis=0, mode="nearest")
+    enu = gaussian_filter1d(streams.fixes_enu(), 1.5, axis=0, mode="nearest")
     stamps = streams.fix_ns
     step = np.linalg.norm(np.diff(enu[:, :2], axis=0), axis=1)
     distance = np.concatenate([[0.0], np.cumsum(step)])

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from topograph.bags import Fix, Heading, Imu, Odometry
-from topograph.geometry import Array, Stamps, from_quaternion
+from topograph.geometry import Array, Datum, Stamps, from_quaternion
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +39,16 @@ class Streams:
     heading: Array
     heading_sigma: Array
     frames: dict[str, str]
+
+    def fixes_enu(self) -> Array:
+        """All fixes (F, 3) east, north, up of their median, m: a frame to compare them with the wheels in, not the map's."""
+        if not len(self.fix_ns):
+            return np.zeros((0, 3))
+        return Datum(*(float(v) for v in np.median(self.lat_lon_h, axis=0))).to_enu(self.lat_lon_h)
+
+    def fix_sigma(self) -> Array:
+        """(F,) the larger horizontal standard deviation of each fix as stated, m."""
+        return np.asarray(np.sqrt(self.fix_cov[:, [0, 1], [0, 1]].max(axis=1)))
 
 
 class StreamsBuilder:

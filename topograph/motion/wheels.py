@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_opening
 
-from topograph.geometry import Array, Datum, Stamps, interpolate, transform
+from topograph.geometry import Array, Stamps, interpolate, transform
 from topograph.motion.streams import Streams
 
 GOOD_FIX = 0.15
@@ -60,16 +60,11 @@ def against_fixes(streams: Streams, odom_T_robot: Array, robot_p_antenna: Array)
     ns = streams.odometry_ns
     steps = len(ns) - 1
     nothing = WheelCheck(np.ones(steps), np.zeros(steps), np.zeros(steps), 1.0, np.zeros((0, 3)))
-    good = (
-        np.sqrt(streams.fix_cov[:, [0, 1], [0, 1]].max(axis=1)) < GOOD_FIX if len(streams.fix_ns) else np.zeros(0, bool)
-    )
-    good &= (streams.fix_ns >= ns[0]) & (streams.fix_ns <= ns[-1])
+    good = (streams.fix_sigma() < GOOD_FIX) & (streams.fix_ns >= ns[0]) & (streams.fix_ns <= ns[-1])
     if good.sum() < LEAST_WINDOWS:
         return nothing
     at = streams.fix_ns[good]
-    fixes = streams.lat_lon_h[good]
-    enu = Datum(*(float(v) for v in np.median(fixes, axis=0))).to_enu(fixes)[:, :2]
-    sigma = np.sqrt(streams.fix_cov[good][:, [0, 1], [0, 1]].max(axis=1))
+    enu, sigma = streams.fixes_enu()[good, :2], streams.fix_sigma()[good]
     poses = interpolate(ns, odom_T_robot, at)
     antenna = transform(poses, robot_p_antenna)[:, :2]
     scale = _scale(at, enu, antenna, sigma)
@@ -92,9 +87,8 @@ def against_fixes(streams: Streams, odom_T_robot: Array, robot_p_antenna: Array)
     speed = np.linalg.norm(np.diff(enu, axis=0), axis=1) / np.maximum(dt, 1e-3)
     wheel = np.linalg.norm(np.diff(antenna, axis=0), axis=1) / np.maximum(dt, 1e-3)
     rows = a[:, None] + np.arange(2 * half)
-    still = 1.18 * np.median(
-        np.hypot(sigma[1:], sigma[:-1])[rows] / np.maximum(dt[rows], 1e-3), axis=1
-    )  # of noise alone
+    # What noise alone makes of a step's length (median of a Rayleigh distribution).
+    still = 1.18 * np.median(np.hypot(sigma[1:], sigma[:-1])[rows] / np.maximum(dt[rows], 1e-3), axis=1)
     middle = np.sqrt(np.maximum(np.median(speed[rows], axis=1) ** 2 - still**2, 0.0))
     slipping &= np.abs(middle - scale * np.mean(wheel[rows], axis=1)) > 0.5 * apart / seconds
     scatter = 1.4826 * np.median(np.abs(speed[rows] - np.median(speed[rows], axis=1)[:, None]), axis=1)

@@ -1,7 +1,6 @@
 """The commands as a user types them: exit codes, one line on what to do, results whole or not at all."""
 
 import json
-import sqlite3
 from pathlib import Path
 
 import numpy as np
@@ -162,13 +161,10 @@ def test_a_refused_map_is_not_saved_until_it_is_accepted(tmp_path: Path) -> None
 
 
 def test_a_map_that_was_edited_is_repaired_into_a_new_one(tmp_path: Path) -> None:
-    from test_store import make
+    from test_store import edit, make
 
     store.save(make(5), tmp_path / "m.gpkg")
-    c = sqlite3.connect(tmp_path / "m.gpkg")
-    with c:
-        c.execute("UPDATE trees SET diameter = 0.5 WHERE id = 2")
-    c.close()
+    assert edit(tmp_path / "m.gpkg", "UPDATE trees SET diameter = 0.5 WHERE id = 2") == 1
     out = call("export", tmp_path / "m.gpkg", tmp_path / "x.csv")
     assert out.exit_code == 5
     assert "topograph repair" in out.output

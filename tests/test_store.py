@@ -92,6 +92,15 @@ def test_round_trip(tmp_path_factory: pytest.TempPathFactory, n: int, seed: int,
         assert a.tree == b.tree
 
 
+def edit(path: Path, statement: str) -> int:
+    """Change a map behind the program's back; how many rows."""
+    c = sqlite3.connect(path)
+    with c:
+        rows = c.execute(statement).rowcount
+    c.close()
+    return rows
+
+
 def test_it_is_a_geopackage(tmp_path: Path) -> None:
     m = make(12)
     store.save(m, tmp_path / "m.gpkg")
@@ -125,17 +134,11 @@ def test_clouds_near_reads_only_those(tmp_path: Path) -> None:
 def test_damage_and_versions(tmp_path: Path) -> None:
     path = tmp_path / "m.gpkg"
     store.save(make(3), path)
-    c = sqlite3.connect(path)
-    with c:
-        c.execute("UPDATE viewpoints SET cloud = zeroblob(length(cloud)) WHERE id=1")
-    c.close()
+    edit(path, "UPDATE viewpoints SET cloud = zeroblob(length(cloud)) WHERE id=1")
     with pytest.raises(MapError, match="damaged"):
         store.load(path)
     store.load(path, clouds=False)
-    c = sqlite3.connect(path)
-    with c:
-        c.execute("UPDATE meta SET value='99' WHERE key='schema_version'")
-    c.close()
+    edit(path, "UPDATE meta SET value='99' WHERE key='schema_version'")
     with pytest.raises(MapError, match="newer"):
         store.load(path)
     path.write_bytes(b"not a map at all" * 100)
@@ -253,10 +256,7 @@ def test_any_file_name(tmp_path: Path, name: str) -> None:
 def test_what_was_not_written_is_not_read(tmp_path: Path, change: str) -> None:
     path = tmp_path / "m.gpkg"
     store.save(make(12), path)
-    c = sqlite3.connect(path)
-    with c:
-        assert c.execute(change).rowcount > 0
-    c.close()
+    assert edit(path, change) > 0
     with pytest.raises(MapError, match="repair"):
         store.load(path)
 
@@ -264,10 +264,7 @@ def test_what_was_not_written_is_not_read(tmp_path: Path, change: str) -> None:
 def test_views_and_triggers_are_not_run(tmp_path: Path) -> None:
     path = tmp_path / "m.gpkg"
     store.save(make(3), path)
-    c = sqlite3.connect(path)
-    with c:
-        c.execute("CREATE VIEW v AS SELECT * FROM trees")
-    c.close()
+    edit(path, "CREATE VIEW v AS SELECT * FROM trees")
     with pytest.raises(MapError, match="view or a trigger"):
         store.load(path)
 

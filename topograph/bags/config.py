@@ -14,6 +14,7 @@ class BagsConfig:
         base_frame: the frame whose poses are estimated.
         extrinsics: frame -> (x, y, z, roll, pitch, yaw) of the sensor in `base_frame`, metres and radians;
             overrules TF.
+        strict: refuse a recording that is truncated or damaged, instead of reading what is whole.
     """
 
     topic_points: str = ""
@@ -24,3 +25,4 @@ class BagsConfig:
     topic_heading: str = ""
     base_frame: str = "base_link"
     extrinsics: dict[str, tuple[float, float, float, float, float, float]] = field(default_factory=dict)
+    strict: bool = False

@@ -7,6 +7,7 @@ import logging
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, cast
@@ -22,7 +23,7 @@ from topograph.bags.clocks import Clocks, Message
 from topograph.bags.config import BagsConfig
 from topograph.bags.frames import Frames
 from topograph.bags.messages import Fix, Heading, Imu, Odometry, Trunks
-from topograph.bags.salvage import why_unreadable
+from topograph.bags.salvage import Salvaged, SalvagedFolder, why_unreadable
 from topograph.bags.scan import Scan
 from topograph.bags.scan import decode as decode_scan
 from topograph.errors import InputError
@@ -33,6 +34,7 @@ log = logging.getLogger(__name__)
 UNDECODED = "cannot be decoded"
 DAMAGED = "announced by the recording's index, not in the file (damaged)"
 
+Reader = AnyReader | Salvaged | SalvagedFolder
 Product = Scan | Odometry | Imu | Fix | Heading | Trunks
 
 
@@ -50,11 +52,12 @@ class Recording:
         undecoded: stream kind -> why the first message that could not be decoded could not.
         given: stream kind -> messages that the file held, usable or not, in the last reading.
         untimed: scans without a time per point, counted by who takes them.
+        notes: what had to be salvaged, a sentence per file.
         count_within: times of recording (from, until before), ns, of the messages that are counted; None: all.
     """
 
     def __init__(self, paths: Sequence[Path], config: BagsConfig | None = None) -> None:
-        self.paths = [_resolve(Path(p)) for p in paths]
+        self.paths = [q for p in paths for q in _resolve(Path(p))]
         self.config = config or BagsConfig()
         self.skipped: Counter[str] = Counter()
         self.frames = Frames(self.config.base_frame, self.config.extrinsics)
@@ -67,17 +70,15 @@ class Recording:
         self.undecoded: dict[str, str] = {}
         self.given: Counter[str] = Counter()
         self.untimed = 0
+        self.notes: list[str] = []
         self.count_within: tuple[int, int] | None = None
         self._counting = True
-        self._readers: list[AnyReader] = []
+        self._readers: list[Reader] = []
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
         try:
-            for path in self.paths:
-                reader = _open(path)
-                self._stack.callback(reader.close)
-                self._readers.append(reader)
+            self._open_all()
             self._index()
         except BaseException:
             self._stack.close()
@@ -86,6 +87,44 @@ class Recording:
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, tb: TracebackType | None) -> None:
         self._stack.close()
+
+    def _open_all(self) -> None:
+        """Open the files; folders that do not open as such are replaced by the files in them, files by what can be salvaged."""
+        waiting, self.paths = self.paths, []
+        for path in waiting:
+            opened: list[tuple[Path, Reader]]
+            try:
+                opened = [(path, _open(path))]
+            except Exception as err:  # whatever the readers' libraries raise on damage
+                why = f"{path}: {why_unreadable(path, err)}"
+                if self.config.strict:
+                    raise InputError(f"{why}; without --strict what is whole in it is read") from err
+                files = recordings_in(path) if path.is_dir() else [path]
+                if not files:
+                    raise InputError(why) from err
+                opened = [(p, self._salvage(p, None if path.is_dir() else err)) for p in files]
+                if path.is_dir():
+                    self.notes.append(f"{path.name}: metadata.yaml does not fit ({err}); its files are read one by one")
+            for p, reader in opened:
+                self._stack.callback(reader.close)
+                self._readers.append(reader)
+                self.paths.append(p)
+
+    def _salvage(self, path: Path, err: Exception | None) -> Reader:
+        """The file, if it opens; otherwise what is whole in it."""
+        if err is None:
+            try:
+                return _open(path)
+            except Exception as own:  # noqa: BLE001  # whatever the readers' libraries raise on damage; told below
+                err = own
+        saved = Salvaged(path)
+        lost = f"not read: {saved.lost}" if saved.lost else "nothing else was found in it"
+        why = "never closed" if path.suffix == ".active" else str(err) or type(err).__name__
+        self.notes.append(
+            f"{path.name}: truncated, damaged or never closed ({why}): {saved.message_count} messages "
+            f"({(saved.end_time - saved.start_time) * 1e-9:.0f} s) were read in sequence; {lost}"
+        )
+        return saved
 
     def _index(self) -> None:
         starts, ends = [], []
@@ -107,20 +146,14 @@ class Recording:
 
     def _read_tf(self) -> None:
         for name, most in (("tf", 500), ("tf_static", 10_000)):  # static last: it wins
-            for reader in self._readers:
-                found = [
-                    c for c in reader.connections if c.topic.endswith(name) and c.msgtype == "tf2_msgs/msg/TFMessage"
-                ]
-                if not found:
-                    continue
-                try:
-                    for n, (c, _, raw) in enumerate(reader.messages(connections=found)):
-                        if n >= most:
-                            break
-                        self._add_tf(name, reader.deserialize(raw, c.msgtype))
-                except Exception as err:  # noqa: BLE001  # whatever the readers' libraries raise on damage; it is counted
-                    self.skipped[f"{name}: damaged"] += 1
-                    log.warning("%s: %s is damaged (%r)", self.paths[0].name, name, err)
+            topics_tf = {t for t, typ in self.types.items() if t.endswith(name) and typ == "tf2_msgs/msg/TFMessage"}
+            for i in range(len(self._readers) if topics_tf else 0):
+                for _, _, c, raw in islice(self._raw(i, topics_tf, None), most):
+                    try:
+                        self._add_tf(name, self._readers[i].deserialize(raw, c.msgtype))
+                    except Exception as err:  # noqa: BLE001  # one message; it is counted
+                        self.skipped[f"{name}: {UNDECODED}"] += 1
+                        log.debug("%s: %s", c.topic, err)
 
     def _add_tf(self, name: str, message: Any) -> None:
         for t in message.transforms:
@@ -173,20 +206,47 @@ class Recording:
     def _raw(
         self, i: int, names: set[str], window_ns: tuple[int, int] | None
     ) -> Iterator[tuple[int, int, Connection, Any]]:
-        reader = self._readers[i]
-        found = [c for c in reader.connections if c.topic in names]
-        if not found:
-            return
-        try:
-            start, stop = window_ns or (None, None)
-            for connection, log_ns, raw in reader.messages(connections=found, start=start, stop=stop):
-                yield i, log_ns, connection, raw
-        except Exception as err:  # noqa: BLE001  # whatever the readers' libraries raise on damage; what is missing is counted
-            if window_ns is not None:
-                self.skipped[f"rest of {self.paths[i].name}: damaged"] += 1
-            log.warning("%s: damaged, the rest of it is left out (%r)", self.paths[i], err)
+        start, stop = window_ns or (None, None)
+        at_last: Counter[str] = Counter()
+        last = start
+        for attempt in ("by its index", "in sequence"):
+            reader = self._readers[i]
+            found = [c for c in reader.connections if c.topic in names]
+            if not found:
+                return
+            given, at_last = at_last, Counter()
+            try:
+                for connection, log_ns, raw in reader.messages(connections=found, start=last, stop=stop):
+                    if log_ns == last and given[connection.topic]:
+                        given[connection.topic] -= 1
+                        at_last[connection.topic] += 1
+                        continue
+                    if log_ns != last:
+                        at_last.clear()
+                    last = log_ns
+                    at_last[connection.topic] += 1
+                    yield i, log_ns, connection, raw
+            except Exception as err:  # whatever the readers' libraries raise on damage; what is missing is counted
+                if self.config.strict:
+                    raise InputError(
+                        f"{self.paths[i]}: damaged ({err}); without --strict what is whole in it is read"
+                    ) from err
+                log.warning("%s: damaged (%r)", self.paths[i], err)
+                if attempt == "in sequence" or not isinstance(reader, AnyReader):
+                    self.skipped[f"rest of {self.paths[i].name}: damaged"] += window_ns is not None
+                    return
+                path = self.paths[i]
+                saved = SalvagedFolder(recordings_in(path)) if path.is_dir() else Salvaged(path)
+                self._stack.callback(saved.close)
+                self._readers[i] = saved
+                at = ((last or self.start_ns) - self.start_ns) * 1e-9
+                self.notes.append(
+                    f"{self.paths[i].name}: damaged at {at:.0f} s ({err}); read on in sequence, not read: {saved.lost or 'nothing'}"
+                )
+            else:
+                return
 
-    def _product(self, kind: str, reader: AnyReader, connection: Connection, raw: Any) -> Product | None:
+    def _product(self, kind: str, reader: Reader, connection: Connection, raw: Any) -> Product | None:
         typ = connection.msgtype
         try:
             if kind == "imu":
@@ -232,23 +292,36 @@ def _sane(values: NDArray[np.float64]) -> bool:
     return bool(np.isfinite(values).all() and np.abs(values).max() < 1e9)
 
 
-def _resolve(path: Path) -> Path:
+def _resolve(path: Path) -> list[Path]:
+    """The files (or the ROS 2 folder) that a name stands for."""
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
     if path.is_dir() and not (path / "metadata.yaml").exists():
-        inside = sorted(p for p in path.iterdir() if p.suffix in (".mcap", ".db3", ".bag"))
-        if len(inside) == 1:
-            return inside[0]
-        raise InputError(f"{path}: a folder without metadata.yaml; name one of its files: {[p.name for p in inside]}")
-    if path.is_file() and path.suffix not in (".bag", ".mcap", ".db3"):
+        inside = recordings_in(path)
+        if not inside:
+            raise InputError(f"{path}: a folder without a recording; give a .bag, a .mcap, a .db3 or a ROS 2 folder")
+        if any(".bag" in p.suffixes for p in inside) and len(inside) > 1:
+            raise InputError(
+                f"{path}: a folder of {len(inside)} bags; name those of one run: {[p.name for p in inside]}"
+            )
+        return inside
+    if path.is_file() and not _RECORDING & set(path.suffixes):
         raise InputError(f"{path}: not a recording; give a .bag, a .mcap, a .db3 or a ROS 2 folder")
-    return path
+    return [path]
+
+
+_RECORDING = {".bag", ".mcap", ".db3"}
+
+
+def recordings_in(folder: Path) -> list[Path]:
+    """The recordings' files in a folder; those of one run are its parts."""
+    return sorted(p for p in folder.iterdir() if p.is_file() and p.suffix in {*_RECORDING, ".active"})
 
 
 def _open(path: Path) -> AnyReader:
-    try:
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-        reader.open()
-    except Exception as err:  # whatever the readers' libraries raise on damage
-        raise InputError(f"{path}: {why_unreadable(path, err)}") from err
+    """The file by its index; raises whatever the readers' libraries do on damage."""
+    if path.suffix == ".active":
+        raise ValueError("it was never closed")
+    reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+    reader.open()
     return reader

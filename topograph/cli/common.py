@@ -73,6 +73,9 @@ def input_options(f: _F) -> _F:
         "--front-end", type=click.Choice(["organised", "thesis"]), default=None,
         help="How trunks are found: ours (organised), or the thesis's pipeline (Algorithms 1-2) to compare with.",
     )(f)  # fmt: skip
+    f = click.option(
+        "--strict", is_flag=True, help="Refuse truncated or damaged recordings, instead of reading what is whole."
+    )(f)
     f = click.option("--base-frame", default=None, help="Frame whose poses are estimated (base_link).")(f)
     f = click.option(
         "--extrinsic", multiple=True, metavar="FRAME=X,Y,Z,R,P,Y",
@@ -92,6 +95,8 @@ def config_of(config_file: Path | None, words: dict[str, Any]) -> Any:
             overrides[f"bags.topic_{kind}"] = words[f"topic_{kind}"]
     if words.get("front_end"):
         overrides["trunks.front_end"] = words["front_end"]
+    if words.get("strict"):
+        overrides["bags.strict"] = True
     if words.get("base_frame"):
         overrides["bags.base_frame"] = words["base_frame"]
     mounts = {}

@@ -94,7 +94,7 @@ def localize_bags(
                 if isinstance(localizer.method, GraphMethod):
                     stretch.add(report, localizer.method)
         refuse_damaged(recording)
-        out.notes += recording.clocks.notes
+        out.notes += [*recording.notes, *recording.clocks.notes]
     out.seconds["read, detect and localize"] = time.perf_counter() - began
     if localizer is None:
         raise InsufficientDataError("no scan in the recording (or in the part that was asked for)")

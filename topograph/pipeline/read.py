@@ -151,7 +151,7 @@ def read_run(
                 else:
                     builder.add(product)
         refuse_damaged(recording)
-        notes += recording.clocks.notes
+        notes += [*recording.notes, *recording.clocks.notes]
         streams = builder.build(recording.skipped)
         mounts: dict[str, Array | None] = {
             k: recording.frames.of(k, streams.frames[k]) for k in ("imu", "fix", "heading") if k in streams.frames

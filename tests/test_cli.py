@@ -188,13 +188,6 @@ def test_failed_commands_leave_no_folders(tmp_path: Path, monkeypatch: pytest.Mo
     assert not list((tmp_path / "results").glob("*"))
 
 
-def test_inspect(tmp_path: Path) -> None:
-    out = call("inspect", drive(tmp_path / "a.bag", seconds=5))
-    assert out.exit_code == 0
-    assert "/odom" in out.output
-    assert "nav_msgs/msg/Odometry" in out.output
-
-
 def test_committed_configuration_is_the_default() -> None:
     text = (Path(__file__).resolve().parents[1] / "configs" / "default.yaml").read_text()
     assert text == dump(Config()), "run: topograph config > configs/default.yaml"
@@ -228,3 +221,39 @@ def test_detect_writes_the_csv(tmp_path: Path, lidar_run: tuple[Path, Truth]) ->
     assert head == "stamp,x,y,z,height,diameter,score"
     assert len(rows) > 100
     assert (tmp_path / "p.png").stat().st_size > 10_000
+
+
+def test_inspect_says_what_map_will_find(tmp_path: Path) -> None:
+    """A stream that stops early, a frame that nobody knows, and a recording without wheels and fixes: exit 3."""
+    out = call("inspect", drive(tmp_path / "a.bag", seconds=5))
+    assert "/odom" in out.output
+    assert out.exit_code == 3  # no trunks
+    t0 = 1_700_000_000 * 10**9
+    with BagWriter(tmp_path / "b.bag") as w:
+        for k in range(100):
+            t = t0 + k * 50_000_000
+            if k < 60:
+                w.imu("/imu", t, t - 2_000_000_000, "imu", np.zeros(3), np.array([0.0, 0.0, 9.81]))
+            w.heading("/heading", t, t, "antenna", np.array([0.0, 0.0, 0.0, 1.0]))
+    out = call("inspect", tmp_path / "b.bag")
+    assert out.exit_code == 3
+    for words in ("silent for 2.0 s from 3.0 s on", "-2.00 s from the other streams'", "frame 'imu' is not in TF: add --extrinsic imu=",
+                  "neither point clouds nor recorded trunks", "neither wheel odometry nor ten usable fixes"):  # fmt: skip
+        assert words in out.output, (words, out.output)
+
+
+def test_inspect_sees_a_wrong_mounting(lidar_run: tuple[Path, Truth]) -> None:
+    bag, _ = lidar_run
+    out = call("inspect", bag)
+    assert "16 rings, -15° to 15°; ring field counts from below" in out.output
+    assert "above the ground: LiDAR" in out.output
+    assert "believed" not in out.output
+    assert "status 2 (RTK or DGNSS)" in out.output
+    out = call("inspect", bag, "--extrinsic", "velodyne=0,0,9,0,0,0")
+    assert "are not to be believed" in out.output
+
+
+def test_doctor() -> None:
+    out = call("doctor")
+    assert out.exit_code == 0, out.output
+    assert "✗" not in out.output

@@ -8,6 +8,7 @@ from topograph.bags.messages import Fix, Heading, Imu, Odometry, Trunks
 from topograph.bags.recording import DAMAGED, UNDECODED, Recording
 from topograph.bags.scan import Scan
 from topograph.bags.scan import decode as decode_scan
+from topograph.bags.survey import StreamSurvey, Survey, survey
 
 __all__ = [
     "DAMAGED",
@@ -19,6 +20,9 @@ __all__ = [
     "Odometry",
     "Recording",
     "Scan",
+    "StreamSurvey",
+    "Survey",
     "Trunks",
     "decode_scan",
+    "survey",
 ]

@@ -181,6 +181,27 @@ class Recording:
             yield m.kind, cast(Product, m.product)
         self.clocks = clocks
 
+    def survey(self, every: int) -> Iterator[tuple[str, int, Product | None, tuple[str, ...]]]:
+        """(kind, time of recording in ns, product with its stamp as it is, fields of a cloud) of all chosen streams.
+
+        Of the clouds only each `every`-th is decoded; the others, and what cannot be decoded, are None.
+        """
+        wanted = {topic: kind for kind, topic in self.chosen.items()}
+        merged = heapq.merge(*(self._raw(i, set(wanted), None) for i in range(len(self._readers))), key=lambda m: m[1])
+        seen: Counter[str] = Counter()
+        for i, log_ns, connection, raw in merged:
+            kind = wanted[connection.topic]
+            seen[kind] += 1
+            if kind == "points" and seen[kind] % every:
+                yield kind, log_ns, None, ()
+                continue
+            product = self._product(kind, self._readers[i], connection, raw)
+            fields: tuple[str, ...] = ()
+            if isinstance(product, Scan) and seen[kind] == every:
+                message: Any = self._readers[i].deserialize(raw, connection.msgtype)
+                fields = tuple(f.name for f in message.fields)
+            yield kind, log_ns, product, fields
+
     def _decoded(self, wanted: dict[str, str], window_ns: tuple[int, int] | None) -> Iterator[Message]:
         """Products in order of recording, stamps as they are; what the index announces and the file does not give is counted."""
         self.given = Counter()

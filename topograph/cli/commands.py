@@ -15,7 +15,7 @@ import numpy as np
 from topograph import __version__
 from topograph.cli.common import (
     config_of,
-    hash_of,
+    hashed,
     input_options,
     main,
     peak_mb,
@@ -81,10 +81,11 @@ def map_command(
             raise MapError(f"{into}: no such map")
         stack.enter_context(store.locked(target))
         old = None if into is None else store.load(into)
+        inputs = stack.enter_context(hashed(bags))
         with progress_bar(quiet) as progress:
             run = pipeline.read_run(bags, config, progress, (from_s, to_s), jobs)
             solved = pipeline.solve_run(run, config, check_fixes=check_fixes, known=old, progress=progress)
-            topo, verdict = _save_results(solved, config, bags, folder, target, true, old, progress, accept)
+            topo, verdict = _save_results(solved, config, inputs, bags, folder, target, true, old, progress, accept)
     no_trees = pipeline.why_no_trees(solved)
     for note in run.notes:
         click.echo(f"note: {note}", err=True)
@@ -110,7 +111,7 @@ def map_command(
 
 
 def _save_results(
-    solved: Any, config: Any, bags: Sequence[Path], folder: Path, target: Path, true: Any, old: Any,
+    solved: Any, config: Any, hashes: Callable[[], list[dict[str, str]]], bags: Sequence[Path], folder: Path, target: Path, true: Any, old: Any,
     progress: Callable[[str, float], None], accept: Sequence[str] = (),
 ) -> Any:  # fmt: skip
     """Write the map (if it has trees, and the audit does not refuse it), path, configuration and reports; returns map and verdict."""
@@ -125,7 +126,7 @@ def _save_results(
     began = time.perf_counter()
     write_tum(folder / "path.tum", solved.estimate.stamps_ns, solved.estimate.map_T_robot)
     verdict = pipeline.audited(solved).accepting(accept)
-    inputs = [{"path": p.name, "sha256": hash_of(p)} for p in bags]
+    inputs = hashes()
     text = dump(config)
     meta = {"config": text, "inputs": json.dumps(inputs), "versions": json.dumps(versions()), "verdict": verdict.word}
     progress("map", 0.0)
@@ -198,7 +199,7 @@ def compare(
 
     config = config_of(config_file, words)
     true = truth_of(truth)
-    with results_folder(results) as folder:
+    with results_folder(results) as folder, hashed(bags) as inputs:
         with progress_bar(quiet) as progress:
             run = pipeline.read_run(bags, config, progress)
             solved = pipeline.solve_run(run, config, progress=progress)
@@ -221,32 +222,10 @@ def compare(
             (folder / "comparison.png").write_bytes(report.comparison_figure(errors))
         flat = [replace(m, name=f"{k}: {m.name}") for k, ms in rows.items() for m in ms]
         report.write_json(
-            folder / "report.json", flat, run.skipped, [{"path": p.name, "sha256": hash_of(p)} for p in bags],
+            folder / "report.json", flat, run.skipped, inputs(),
             solved.seconds, peak_mb(), notes=run.notes, versions=versions(),
         )  # fmt: skip
     click.echo(f"written: {folder}")
-
-
-@main.command()
-@click.argument("bags", nargs=-1, required=True, type=click.Path(path_type=Path))
-@input_options
-def inspect(bags: tuple[Path, ...], config_file: Path | None, **words: Any) -> None:
-    """Say what BAGS hold: topics, types, counts, which stream is taken for what, sensor frames."""
-    from topograph.bags import Recording, topics
-
-    config = config_of(config_file, words)
-    recording = Recording(bags, config.bags)
-    try:
-        with recording:
-            chosen, frames = recording.chosen, recording.frames
-            types, counts, duration = dict(recording.types), recording.counts, recording.duration_s
-    finally:
-        for topic, kind in sorted(recording.types.items()):
-            click.echo(f"  {topic:<36} {kind:<44} {recording.counts[topic]:>9}")
-    click.echo(f"{', '.join(map(str, bags))}: {duration:.1f} s, {len(types)} topics, {sum(counts.values())} messages")
-    for kind in topics.KINDS:
-        click.echo(f"  {kind:<10} {chosen.get(kind, '– (none)')}")
-    click.echo(f"  frames known from {frames.base}: {', '.join(frames.names()) or 'none'}")
 
 
 @main.command()
@@ -287,8 +266,11 @@ def detect(
 
     config = config_of(config_file, words)
     true = truth_of(truth)
-    with progress_bar(quiet) as progress:
+    with ExitStack() as stack:
+        hashes = stack.enter_context(hashed(bags if results is not None else ()))
+        progress = stack.enter_context(progress_bar(quiet))
         run = pipeline.read_run(bags, config, progress, jobs=jobs)
+        inputs = hashes()
     if run.scans == 0:
         raise InputError("no point cloud and no trunk detections; name a topic with --topic-points or --topic-trunks")
     # What a single scan doubts is for the map to decide; here it would only be a false trunk.
@@ -337,7 +319,6 @@ def detect(
         picture.write_bytes(report.scan_figure(scan, mount, shown, feet))
     if results is not None:
         results.mkdir(parents=True, exist_ok=True)
-        inputs = [{"path": p.name, "sha256": hash_of(p)} for p in bags]
         report.write_json(
             results / "report.json",
             metrics,
@@ -415,9 +396,12 @@ def demo(context: click.Context, folder: Path, seed: int, quiet: bool) -> None:
             progress=lambda share: progress("simulate", share),
         )  # fmt: skip
         config = Config()
-        run = pipeline.read_run([bag], config, progress)
-        solved = pipeline.solve_run(run, config, progress=progress)
-        topo, _ = _save_results(solved, config, [bag], folder, folder / "orchard.gpkg", truth, None, progress)
+        with hashed([bag]) as inputs:
+            run = pipeline.read_run([bag], config, progress)
+            solved = pipeline.solve_run(run, config, progress=progress)
+            topo, _ = _save_results(
+                solved, config, inputs, [bag], folder, folder / "orchard.gpkg", truth, None, progress
+            )
         record(
             later, seed, "olive", DriveConfig(run=3, longest_s=30.0), SensorConfig(gnss="none"),
             progress=lambda share: progress("simulate a later run, without GNSS", share),

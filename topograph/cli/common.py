@@ -10,6 +10,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib import metadata
@@ -176,6 +177,17 @@ def hash_of(path: Path) -> str:
             while block := f.read(1 << 22):
                 h.update(block)
     return h.hexdigest()
+
+
+@contextmanager
+def hashed(paths: Sequence[Path]) -> Iterator[Callable[[], list[dict[str, str]]]]:
+    """Names and hashes of files, computed beside the reading: what one of the two has read, the other finds in memory."""
+    with ThreadPoolExecutor(1) as pool:
+        waiting = [(p.name, pool.submit(hash_of, p)) for p in paths if p.exists()]
+        try:
+            yield lambda: [{"path": name, "sha256": w.result()} for name, w in waiting]
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def versions() -> dict[str, str]:

@@ -13,7 +13,7 @@ import numpy as np
 from topograph import __version__
 from topograph.cli.common import (
     config_of,
-    hash_of,
+    hashed,
     input_options,
     main,
     peak_mb,
@@ -61,7 +61,7 @@ def localize(
     topo = store.load(map_file, clouds=method != "graph")
     if true is not None and topo.datum is None:
         raise UsageError("--truth needs a georeferenced map: without a datum the two frames have nothing in common")
-    with results_folder(results) as folder:
+    with results_folder(results) as folder, hashed((map_file, *bags)) as hashes:
         with progress_bar(quiet) as progress:
             first = "thesis" if method == "thesis" else "graph"
             run = pipeline.localize_bags(topo, bags, config, first, progress, (from_s, to_s))
@@ -91,7 +91,7 @@ def localize(
             figures["Errors"] = localization_error_figure(by_method)
             (folder / "errors.png").write_bytes(figures["Errors"])
         (folder / "localization.png").write_bytes(figures["Localization"])
-        inputs = [{"path": p.name, "sha256": hash_of(p)} for p in (map_file, *bags)]
+        inputs = hashes()
         said = verdict(run.reports, run.distance)
         notes = [*run.notes, said]
         if run.exploded:

@@ -1,6 +1,7 @@
 """Straight lines: bags to a map, a map and bags to poses. `mapping` holds the one loop (associate <-> solve)."""
 
 from topograph.pipeline.auditing import audited
+from topograph.pipeline.inspecting import Inspection, Role, inspect_bags
 from topograph.pipeline.localizing import Replay, localize_bags
 from topograph.pipeline.mapping import (
     Solved,
@@ -15,12 +16,15 @@ from topograph.pipeline.mapping import (
 from topograph.pipeline.read import Run, read_run, scan_near
 
 __all__ = [
+    "Inspection",
     "Replay",
+    "Role",
     "Run",
     "Solved",
     "audited",
     "baseline",
     "extend",
+    "inspect_bags",
     "localize_bags",
     "map_T_scans",
     "read_run",

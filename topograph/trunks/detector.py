@@ -111,6 +111,23 @@ def candidates(
     )
 
 
+def heights_above_ground(scan: Scan, base_T_lidar: Array) -> tuple[float, float]:
+    """How high the LiDAR and the base stand above the ground around, m; NaN where no ground is seen."""
+    scan = once(scan)
+    ring, tangent = rings_of(scan, bool(base_T_lidar[2, 2] < 0))
+    *_, low = organise(scan.xyz, ring, _NO_TIME, base_T_lidar, np.zeros(6), len(tangent), 1.0, 20.0)
+    if int((low < NOTHING).sum()) < LEAST_GROUND:
+        return float("nan"), float("nan")
+    plane, _ = fit_ground(low)
+    return float(base_T_lidar[2, 3] - plane[0]), float(-plane[0])
+
+
+NOTHING = 1e8
+"""Cells without a point are higher, m."""
+LEAST_GROUND = 20
+"""Cells of a square metre below which no ground is fitted."""
+
+
 class Detector:
     """Scan -> trunks in `base_link` at the scan's stamp; holds the mounting and the settings, nothing else."""
 

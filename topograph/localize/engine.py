@@ -20,6 +20,11 @@ ASTRAY = 0.3
 """Deviation of a tree's place in the middle of the view, in mean spacings of trees, beyond which it is searched anew."""
 OVERRULE = 0.01
 """Share of the risk at which the shadow may overrule a track: it is asked every metre, and the track was sure as well."""
+UNSEEN = 4.0
+"""Without a mapped tree for so many metres, wheels alone say where the robot is: wheels that slip or are off by 5 % need less to be
+20 cm off."""
+MET, FADE = 0.5, 0.9
+"""Share of the near mapped trees, of those that should be seen, below which a track is doubted; weight of the scans before."""
 NO_PAIRS = np.zeros((0, 2), np.int64)
 STATES = ("searching", "ambiguous", "tracking", "degraded", "lost")
 
@@ -76,10 +81,15 @@ class Engine:
         self.risk = 1.0
         self.sums = np.zeros(2)
         self._matched_at = 0.0
+        self._met = np.zeros(2)
         self.losses = 0
 
-    def step(self, move: Move, sweep: Sweep) -> Belief:
-        """One scan further."""
+    def step(self, move: Move, sweep: Sweep, doubted: Move | None = None) -> Belief:
+        """One scan further. Where the trunks say that wheels or gyro are wrong, `doubted` is the motion made wide: a track follows it,
+        and its second opinion begins anew. What is searched with stays as stiff as the sensors promise: a world that only fits
+        when it is bent is another one."""
+        if doubted is not None and self.track is not None:
+            move, self.hunt = doubted, _Hunt(Submap(self.config, self.visibility))
         self.hunt.submap.step(move, sweep)
         if self.track is None:
             self._look()
@@ -148,6 +158,7 @@ class Engine:
         self.risk = h.posterior.risk
         self.state = "tracking"
         self.sums[:] = 0.0
+        self._met[:] = 0.0
         self._matched_at = self.track.run
         self.hunt = _Hunt(Submap(self.config, self.visibility))
         return self.track
@@ -174,6 +185,9 @@ class Engine:
         found[match[match >= 0]] = True
         self._suspect(f, z, m2, logdet, match, found, reach, hidden)
         looked = found | (~hidden & (reach < c.view))
+        expected = (f.tree >= 0) & ~hidden & (reach < 0.5 * c.view)
+        chance = self.visibility.table()[np.searchsorted(BINS, reach[expected])]
+        self._met = FADE * self._met + (float(found[expected].sum()), float(chance.sum()))
         f.looks[looked] += 1
         absorb(f, used, m2, match, c.gate)
         mapped = np.flatnonzero(match >= 0)
@@ -185,7 +199,10 @@ class Engine:
         stale = (f.tree < 0) & (((f.looks >= 6) & (f.hits < 0.25 * f.looks)) | (f.run - f.seen > 15.0))
         f.keep(~(away | stale))
         sigma = float(np.sqrt(max(f.cov[0, 0], f.cov[1, 1])))
-        self.state = "degraded" if sigma > c.degraded or f.run - self._matched_at > 15.0 else "tracking"
+        doubt = self.sums[0] > 0.5 * c.lost or self.sums[1] > 0.5 * c.slip
+        doubt |= self._met[0] < MET * self._met[1] and self._met[1] > 3.0
+        far = f.run - self._matched_at > UNSEEN
+        self.state = "degraded" if sigma > c.degraded or doubt or far else "tracking"
         if sigma > 5.0 * c.degraded:
             self.sums[0] = np.inf
         return pairs

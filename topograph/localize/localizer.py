@@ -15,6 +15,7 @@ from topograph.localize.config import LocalizeConfig
 from topograph.localize.engine import Belief, Engine
 from topograph.localize.index import build_index
 from topograph.localize.method import Fix, Method, Report
+from topograph.localize.slip import SlipWatch
 from topograph.localize.submap import Move, Sweep
 from topograph.motion import Leg, Reckoner, twist_during, up_at
 from topograph.topomap import TopoMap
@@ -22,6 +23,9 @@ from topograph.trunks import smeared
 
 HEADING_FLOOR = 0.004
 """Least deviation of a heading from trees for learning the gyro's bias, rad: its errors last over many scans."""
+
+CLOCK_SET = 3
+"""So many scans in a row that are older than the last one: it is the clock that was set back."""
 
 Detect = Callable[[Scan, Array, Array | None], Trunks]
 
@@ -55,15 +59,25 @@ class Localizer:
         self._robot_R_imu = robot_R_imu
         self._recent_odometry: list[Odometry] = []
         self._recent_imu: list[Imu] = []
+        self._heard_ns = 0
+        self._old = 0
 
     def update(self, scan: Scan | Trunks, odometry: Iterable[Odometry | Imu] = ()) -> Fix | None:
         """One scan, and the odometry and IMU messages since the last one; the pose at the scan's stamp, or None.
 
-        Messages that are newer than the scan may be among them; they are kept for the next one.
+        Messages that are newer than the scan may be among them; they are kept for the next one. A scan that is older than the
+        last one changes nothing.
         """
         for m in odometry:
             self.reckoner.add(m)
             (self._recent_imu if isinstance(m, Imu) else self._recent_odometry).append(m)  # type: ignore[arg-type]  # each list takes its own kind
+            self._heard_ns = m.stamp_ns
+        if scan.stamp_ns <= 0 and self._heard_ns > 0:
+            scan = replace(scan, stamp_ns=self._heard_ns)  # a driver that does not stamp: the newest message's time
+        if self.report is not None and scan.stamp_ns < self.report.stamp_ns and self._old < CLOCK_SET:
+            self._old += 1
+            return self.report.fix
+        self._old = 0
         if isinstance(scan, Scan):
             if self._detect is None:
                 raise TypeError("a Localizer that is fed scans needs `detect`")
@@ -83,7 +97,10 @@ class Localizer:
         self.report = self.method.step(scan, self.leg)
         fix = self.report.fix
         if fix is not None and np.isfinite(fix.cov[2, 2]):
-            self.reckoner.hold(float(yaw_of(fix.map_T_robot)), max(float(np.sqrt(fix.cov[2, 2])), HEADING_FLOOR))
+            x, y = fix.map_T_robot[:2, 3]
+            self.reckoner.hold(
+                np.array([x, y, yaw_of(fix.map_T_robot)]), max(float(np.sqrt(fix.cov[2, 2])), HEADING_FLOOR)
+            )
         return fix
 
 
@@ -97,6 +114,7 @@ class GraphMethod:
         self._tilt_cov = np.diag([100.0, 0.0, 0.0])
         self._vertical = np.array([0.0, 0.0, 1.0])
         self._row = _row_direction(topo)
+        self._slip = SlipWatch()
 
     def _begin(self, trunks: Trunks) -> Engine:
         """The index is built at the height at which this front end states its trunks."""
@@ -120,9 +138,11 @@ class GraphMethod:
             leg = self._upright(leg, trunks)
         level_T_robot = from_xyz_rpy(0, 0, 0, leg.roll, leg.pitch, 0)
         flat = transform(level_T_robot, trunks.p) if len(trunks) else np.zeros((0, 3))
-        self.move = move_of(leg, self.config)
+        watched = self._slip.check(flat, leg)
+        self.move = move_of(watched, self.config)
         self.sweep, rows = sweep_of(trunks, level_T_robot, leg, self.config)
-        belief = self.engine.step(self.move, self.sweep)
+        stiff = move_of(leg, self.config)
+        belief = self.engine.step(stiff, self.sweep, None if watched is leg else self.move)
         self.sweep_pairs = belief.pairs
         belief = replace(belief, pairs=np.stack([rows[belief.pairs[:, 0]], belief.pairs[:, 1]], axis=1))
         self._rise(leg, belief, trunks, flat)
@@ -140,7 +160,8 @@ class GraphMethod:
         """Without an IMU the trunks say which way is up: on average they grow vertically."""
         if len(trunks) >= 5 and (trunks.axis[:, 2] < 1.0 - 1e-9).any():
             up = np.median(trunks.axis, axis=0)
-            self._vertical += 0.5 * (up / np.linalg.norm(up) - self._vertical)
+            if float(up[2]) > 0.5:  # False for NaN
+                self._vertical += 0.5 * (up / np.linalg.norm(up) - self._vertical)
         x, y, z = self._vertical / np.linalg.norm(self._vertical)
         return replace(leg, roll=float(np.arctan2(y, z)), pitch=float(-np.arcsin(x)))
 
@@ -217,12 +238,18 @@ def sweep_of(trunks: Trunks, level_T_robot: Array, leg: Leg, config: LocalizeCon
     R = level_T_robot[:3, :3]
     p = trunks.p @ R.T
     across = np.eye(3) - trunks.axis[:, :, None] * trunks.axis[:, None, :]  # along itself a trunk may be anywhere
-    cov = across @ np.where(np.isfinite(trunks.cov), trunks.cov, 0.0) @ across
+    sound = np.isfinite(trunks.cov).all(axis=(1, 2))
+    sound &= np.asarray(np.diagonal(trunks.cov, axis1=1, axis2=2) >= 0).all(axis=1)
+    cov = across @ np.where(np.reshape(sound, (-1, 1, 1)), trunks.cov, 0.0) @ across
     flat = np.array((R @ cov @ R.T)[:, :2, :2])
     reach = np.hypot(p[:, 0], p[:, 1])
     least = (0.02 + 0.001 * reach) ** 2
     if not leg.level:
         least = least + (reach * config.planar_tilt**2) ** 2
     flat[:, [0, 1], [0, 1]] = np.maximum(flat[:, [0, 1], [0, 1]], least[:, None])
+    torn = np.atleast_1d(
+        flat[:, 0, 1] ** 2 >= flat[:, 0, 0] * flat[:, 1, 1]
+    )  # no covariance: only its size is believed
+    flat[torn, 0, 1] = flat[torn, 1, 0] = 0.0
     ok = np.isfinite(p).all(axis=1) & (reach > 0.3) & trunks.likely
     return Sweep(p[ok, :2], flat[ok], trunks.diameter[ok], np.full(int(ok.sum()), 0.04**2)), np.flatnonzero(ok)

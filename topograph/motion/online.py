@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import insort
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from topograph.bags import Imu, Odometry
 from topograph.geometry import Array, exp, from_quaternion, inverse, log
+from topograph.motion.against import Against
 from topograph.motion.inertial import GRAVITY
 from topograph.motion.reckon import _filter, _quaternion_of
 
+SET_BACK = 20
+"""So many messages in a row that are older than the last one used: their clock was set back."""
 JUMP = (15.0, 0.5)
 """A step longer than so many m/s and m is a reset of the odometry."""
 CARRY_NS = 100_000_000
@@ -21,6 +25,8 @@ GAP_NS = 300_000_000
 """Wheels silent for longer (or for three periods) do not cover the time, and what they say of it later is not used."""
 GYRO_GAP_NS = 200_000_000
 """The same of the gyro: a rate says nothing of what comes so much later."""
+FARTHEST = 1e7
+"""Of odometry from its origin, m."""
 REST = (0.005, 0.001)
 """Slower than so many m/s and rad/s between two messages of the wheels is standing."""
 SETTLE_NS = 200_000_000
@@ -38,6 +44,8 @@ HEADING_WALK = 1e-3
 """How far gyro and map may part by noise alone, rad/√s."""
 LEVEL_SIGMA = 0.01
 """Roll and pitch as gravity holds them over time, rad."""
+SOUND = (35.0, 160.0)
+"""Full scale of MEMS sensors, rad/s and m/s²: what is beyond was not measured."""
 MOVING_SIGMA = 0.06
 """The same from less than a second of a drive, rad: the suspension's own accelerations."""
 
@@ -104,20 +112,31 @@ class Reckoner:
         self._heard: tuple[int, Array] | None = None  # the last message of the wheels that was passed
         self._period_ns = 0  # of these messages
         self._attitude: _Attitude | None = None
-        self._unit = 1.0
+        self._unit, self._rate_unit = 1.0, 1.0
         self._told, self._held_ns = 0.0, 0  # the gyro's heading so far, and the stamp of the last heading from outside
         self._drift, self._drift_cov = np.zeros(2), np.diag([HALF_TURN**2, BIAS_SIGMA**2])  # rad and rad/s
         self._sample: tuple[int, Array, Array] | None = None  # the last one integrated
         self._at_ns: int | None = None
+        self._against = Against()
+        self._late: dict[str, int] = {}
 
     def add(self, message: Odometry | Imu) -> None:
-        """One message; stamps rise within each kind. What is not finite is passed over."""
+        """One message. Older ones than were used already are passed over, and so is what is not finite or beyond what anything
+        measures."""
         if isinstance(message, Imu):
-            if np.isfinite(message.gyro).all() and np.isfinite(message.accel).all():
-                self._imu.append((message.stamp_ns, message.gyro, message.accel))
-        elif np.isfinite(message.odom_T_child).all() and np.linalg.norm(message.odom_T_child[3:]) > 0.5:
+            sound = np.abs(message.gyro).max() < SOUND[0] and np.abs(message.accel).max() < SOUND[1]  # False for NaN
+            if sound and self._in_time("imu", message.stamp_ns, self._sample):
+                insort(self._imu, (message.stamp_ns, message.gyro, message.accel), key=_stamp)
+        elif np.abs(message.odom_T_child).max() < FARTHEST and np.linalg.norm(message.odom_T_child[3:]) > 0.5:
             pose = from_quaternion(message.odom_T_child[:3], message.odom_T_child[3:])
-            self._wheels.append((message.stamp_ns, pose @ self.child_T_robot))
+            if self._in_time("wheels", message.stamp_ns, self._heard):
+                insort(self._wheels, (message.stamp_ns, pose @ self.child_T_robot), key=_stamp)
+
+    def _in_time(self, kind: str, stamp_ns: int, last: tuple[int, Array] | tuple[int, Array, Array] | None) -> bool:
+        """Whether a message is newer than the last one that was used; many older ones in a row are a clock that was set back."""
+        late = last is not None and stamp_ns <= last[0]
+        self._late[kind] = self._late.get(kind, 0) + 1 if late else 0
+        return not late or self._late[kind] > SET_BACK
 
     def advance(self, stamp_ns: int) -> Leg:
         """Motion since the last call, with all messages up to `stamp_ns`; nothing moves when the stamp does not rise."""
@@ -138,22 +157,34 @@ class Reckoner:
                 "pitch": float(np.arcsin(np.clip(-R[2, 0], -1, 1))),
                 "tilt_sigma": self._attitude.sigma,
             }
-        step, up, distance, turned = _along_gyro(steps, times, rotations) if gyro else _along_wheels(steps)
+        by_wheels = _along_wheels(steps)
+        step, up, distance, turned = _along_gyro(steps, times, rotations) if gyro else by_wheels
+        told = float(by_wheels[0][2])
+        doubt = self._against.take(
+            float(step[2]), told, self._against.scale * step[:2], 0.0 if blind or first else seconds
+        )
+        if gyro and self._against.gyro_is_wrong:
+            gyro, (step, up, distance, turned) = False, by_wheels
+        scale = np.array([self._against.scale, self._against.scale, 1.0])
+        step, up, distance = step * scale, up * scale[0], distance * scale[0]
         self._told += float(step[2])
         if not gyro:
             self._drift_cov[:] = np.diag([HALF_TURN**2, self._drift_cov[1, 1]])
         return Leg(
             step=step, up=up, distance=distance, turned=turned, seconds=seconds, blind=blind, gyro=gyro,
-            rate_sigma=min(float(np.sqrt(self._drift_cov[1, 1])), USUAL_BIAS), level=self._attitude is not None, **tilt,
+            rate_sigma=float(np.hypot(min(np.sqrt(self._drift_cov[1, 1]), USUAL_BIAS), doubt)), level=self._attitude is not None, **tilt,
         )  # fmt: skip
 
-    def hold(self, yaw: float, sigma: float) -> None:
-        """The heading at the last stamp as a map has it, rad: what the gyro steadily drifts away from it is bias.
+    def hold(self, pose: Array, sigma: float) -> None:
+        """The pose (3,) at the last stamp as a map has it, x, y (m) and heading (rad, ± `sigma`): what the gyro steadily drifts away
+        from the heading is bias.
 
         A Kalman filter over the offset of the two headings and its rate; a robot that never stands learns its bias so.
         """
+        self._against.see(pose)
         if self._attitude is None or self._at_ns is None:
             return
+        yaw = float(pose[2])
         dt = (self._at_ns - self._held_ns) * 1e-9 if self._held_ns else 0.0
         self._held_ns = self._at_ns
         F = np.array([[1.0, dt], [0.0, 1.0]])
@@ -232,7 +263,7 @@ class Reckoner:
         rates += [g for ns, g in self._resting if from_ns < ns <= to_ns]
         if not rates:
             return
-        off = self.robot_R_imu @ np.mean(rates, axis=0) - self.bias
+        off = self.robot_R_imu @ np.mean(rates, axis=0) * self._rate_unit - self.bias
         noise = BIAS_NOISE**2 / dt
         P = self._drift_cov
         P[1, 1] += BIAS_WALK**2 * dt
@@ -279,7 +310,9 @@ class Reckoner:
         covered = bool(np.diff(seen).max() <= GYRO_GAP_NS)
         stamps = np.array([a.ns, *(m[0] for m in used), stamp_ns], np.int64)
         rows = [before, *used, end]
-        rate = np.array([m[1] for m in rows]) @ R.T - self.bias
+        if self._against.degrees and self._rate_unit == 1.0:
+            self._rate_unit, self.bias = np.pi / 180.0, np.zeros(3)
+        rate = np.array([m[1] for m in rows]) @ R.T * self._rate_unit - self.bias
         force = np.array([m[2] for m in rows]) @ R.T * self._unit
         speed, change = self._drive(stamps)
         force[:, 0] -= change
@@ -304,6 +337,9 @@ class Reckoner:
         mean = np.mean([m[2] for m in ready], axis=0)
         size = float(np.linalg.norm(mean))
         self._unit = GRAVITY if 0.8 < size < 1.2 else 1.0  # some drivers report g
+        if not 0.7 < size * self._unit / GRAVITY < 1.3:
+            del self._imu[:-100]  # no gravity: nothing says how it hangs
+            return False
         if self.robot_R_imu is None:
             self.robot_R_imu = _upright(mean / max(size, 1e-6))
         speed, change = self._drive(stamps[: len(ready)])
@@ -317,6 +353,10 @@ class Reckoner:
         roll, pitch = float(np.arctan2(f[1], f[2])), float(np.arctan2(-f[0], np.hypot(f[1], f[2])))
         self._attitude = _Attitude(int(stamps[0]), _quaternion_of(roll, pitch), 0.0, sigma)
         return True
+
+
+def _stamp(message: tuple[int, Array] | tuple[int, Array, Array]) -> int:
+    return message[0]
 
 
 def _is_jump(move: Array, dt: float) -> bool:

@@ -1,0 +1,103 @@
+"""Whether wheels and gyro tell how the robot went: two scans, one after the other, see the same trunks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from topograph.geometry import Array
+from topograph.motion import Leg
+
+REACH = 12.0
+"""Trunks that are used, m: their place is known well."""
+NEAR = 0.8
+"""Farthest that a trunk may be from where the wheels expect it, m: half of a close spacing of trees."""
+LEAST = 2
+"""Pairs of trunks that tell of motion."""
+OFF, SHARE, SIGMAS = 0.1, 0.35, 4.0
+"""Trunks that put the robot further from the wheels' place than so many m, such a share of the way and so many deviations of their own."""
+TURN, TURN_SHARE = 0.03, 0.1
+"""The same of the gyro's turn, rad."""
+SPREAD = 0.05
+"""Least deviation of a trunk between two scans, m."""
+LEGS = (3, 15)
+"""Over so many legs it is judged: what is seen of the same trunks adds up, their noise does not."""
+WIDER = 1.5
+"""A rate that is wrong is doubted by so much of what it is off by."""
+
+
+class SlipWatch:
+    """Held before a localizer: where the trunks contradict the wheels, legs are called blind, and turns are doubted (see `Leg`)."""
+
+    def __init__(self) -> None:
+        self._last: Array | None = None  # (N, 2) of the last scan, levelled robot frame
+        self._rows: list[
+            Array
+        ] = []  # what trunks add to a leg (x, y m, yaw rad), its way and turn, deviations of place and yaw, seconds
+
+    def check(self, flat: Array, leg: Leg) -> Leg:
+        """The leg up to a scan whose trunks stand at `flat` (N, 2 or 3), m, in the levelled robot frame."""
+        flat = flat[np.isfinite(flat).all(axis=1), :2]
+        flat = flat[np.hypot(*flat.T) < REACH] if len(flat) else flat
+        last, self._last = self._last, flat
+        if leg.seconds <= 0 or last is None:
+            self._rows = []
+            return leg
+        found = _residual(last, flat, leg)
+        if found is not None:
+            way = float(np.hypot(*leg.step[:2]))
+            self._rows = [*self._rows, np.array([*found[0], way, abs(leg.step[2]), *found[1], leg.seconds])][-LEGS[1] :]
+        if len(self._rows) < LEGS[0]:
+            return leg
+        # Suffixes of the last legs, from the third on.
+        rows = np.array(self._rows)[::-1]
+        sums, least = np.cumsum(rows, axis=0)[LEGS[0] - 1 :], rows[LEGS[0] - 1 :]
+        place = np.maximum(np.maximum(OFF, SHARE * sums[:, 3]), SIGMAS * np.maximum(rows[0, 5], least[:, 5]))
+        turn = np.maximum(np.maximum(TURN, TURN_SHARE * sums[:, 4]), SIGMAS * np.maximum(rows[0, 6], least[:, 6]))
+        if (np.hypot(*sums[:, :2].T) > place).any():
+            leg = replace(leg, blind=leg.seconds)
+        wrong = np.abs(sums[:, 2]) > turn
+        if wrong.any():
+            rate = float((np.abs(sums[wrong, 2]) / sums[wrong, 7]).max())
+            leg = replace(leg, rate_sigma=max(leg.rate_sigma, WIDER * rate))
+        return leg
+
+
+def _residual(last: Array, now: Array, leg: Leg) -> tuple[Array, Array] | None:
+    """By how much (x forward, y to the left, m, yaw, rad) the robot moved more than the leg says, and the deviations of place and
+    yaw; None where trunks do not tell."""
+    if len(last) < LEAST or len(now) < LEAST:
+        return None
+    c, s = np.cos(leg.step[2]), np.sin(leg.step[2])
+    moved = now @ np.array([[c, s], [-s, c]]) + leg.step[:2]
+    apart = np.hypot(*(moved[:, None, :] - last[None, :, :]).transpose(2, 0, 1))
+    there, back = apart.argmin(axis=1), apart.argmin(axis=0)
+    mutual = (back[there] == np.arange(len(now))) & (apart.min(axis=1) < NEAR)
+    a, b = moved[mutual], last[there[mutual]]
+    if len(a) >= 4:
+        off = (b - a) - np.median(b - a, axis=0)
+        size = np.hypot(*off.T)
+        a, b = (
+            a[size <= 3.0 * max(float(np.median(size)), SPREAD)],
+            b[size <= 3.0 * max(float(np.median(size)), SPREAD)],
+        )
+    if len(a) < LEAST:
+        return None
+    ca, cb = a.mean(axis=0), b.mean(axis=0)
+    u, v = a - ca, b - cb
+    lever = float(np.sum(u**2))
+    if lever < SHORT**2:
+        return None
+    yaw = float(np.arctan2(np.sum(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]), np.sum(u * v)))
+    R = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    left = v - u @ R.T
+    sigma = max(float(np.sqrt(np.sum(left**2) / max(2 * len(a) - 3, 1))), SPREAD)
+    of_yaw = sigma / np.sqrt(lever)
+    off = cb + R @ (leg.step[:2] - ca) - leg.step[:2]
+    of_place = float(np.hypot(sigma / np.sqrt(len(a)), of_yaw * float(np.hypot(*(ca - leg.step[:2])))))
+    return np.array([off[0], off[1], yaw]), np.array([of_place, of_yaw])
+
+
+SHORT = 2.0
+"""Trunks that stand closer together say nothing of turns, m."""

@@ -11,6 +11,9 @@ from topograph.bags.messages import Array, Fix, Heading, Imu, Odometry, Trunks
 from topograph.bags.scan import decode as decode_scan
 from topograph.geometry import from_quaternion
 
+FARTHEST = 1e5
+"""Of a trunk from its sensor, m: beyond, the number is none."""
+
 
 def stamp_of(header: Any) -> int:
     """Nanoseconds of a header stamp."""
@@ -141,7 +144,7 @@ def _trunks(
     clouds: tuple[Any, ...] = (),
     surface: bool = False,
 ) -> Trunks:
-    keep = np.asarray(np.isfinite(p).all(axis=1) & np.isfinite(axis).all(axis=1))
+    keep = np.asarray((np.abs(p) < FARTHEST).all(axis=1) & np.isfinite(axis).all(axis=1))  # False for NaN
     n = int(keep.sum())
     return Trunks(
         stamp_of(m.header),

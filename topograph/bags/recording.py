@@ -252,7 +252,7 @@ class Recording:
                     raise InputError(
                         f"{self.paths[i]}: damaged ({err}); without --strict what is whole in it is read"
                     ) from err
-                log.warning("%s: damaged (%r)", self.paths[i], err)
+                log.info("%s: damaged (%r)", self.paths[i], err)
                 if attempt == "in sequence" or not isinstance(reader, AnyReader):
                     self.skipped[f"rest of {self.paths[i].name}: damaged"] += window_ns is not None
                     return

@@ -165,7 +165,7 @@ def _typestore(channels: Collection[Channel]) -> Typestore:
             elif c.definition:
                 types.update(get_types_from_msg(c.definition, c.msgtype))
         except Exception as err:  # noqa: BLE001  # a damaged definition costs its topic, which then cannot be decoded
-            log.warning("the definition of %s is damaged (%r)", c.msgtype, err)
+            log.info("the definition of %s is damaged (%r)", c.msgtype, err)
     if not any(c.definition for c in channels):
         return get_typestore(Stores.ROS2_HUMBLE)
     store = get_typestore(Stores.EMPTY)

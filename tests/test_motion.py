@@ -378,3 +378,61 @@ def test_a_frozen_receiver_is_counted() -> None:
     skipped: Counter[str] = Counter()
     assert len(b.build(skipped).fix_ns) == 21
     assert skipped == Counter({"fix: position repeated (frozen)": 39})
+
+
+def test_the_map_teaches_the_wheels_scale_and_whom_to_believe() -> None:
+    """Wheels that say 0.8 of the way; a gyro in degrees; one that is dead while the wheels turn with the map."""
+    from topograph.motion.against import Against
+
+    def drive(gyro: float, wheels: float, way: float = 1.0, seconds: float = 40.0) -> Against:
+        against, pose = Against(), np.zeros(3)
+        against.see(pose.copy())
+        for k in range(int(seconds * 10)):
+            rate = 0.3 * np.sin(0.2 * k / 10)
+            pose = pose + [0.1 * np.cos(pose[2]), 0.1 * np.sin(pose[2]), 0.1 * rate]
+            step = np.array([0.1 * way * against.scale, 0.0])
+            against.take(0.1 * rate * gyro, 0.1 * rate * wheels, step, 0.1)
+            against.see(pose.copy())
+        return against
+
+    assert drive(1.0, 1.0, way=0.8).scale == pytest.approx(1 / 0.8, abs=0.02)
+    sound = drive(1.0, 0.6)
+    assert not sound.gyro_is_wrong
+    assert not sound.degrees
+    assert sound.scale == pytest.approx(1.0, abs=0.01)
+    assert sound.take(0.0, 0.0, np.zeros(2), 0.1) == 0.0  # wheels that skid in turns do not discredit a gyro
+    assert drive(57.3, 1.0).degrees
+    assert drive(0.0, 1.0).gyro_is_wrong
+    assert drive(-1.0, 1.0).take(0.0, 0.0, np.zeros(2), 0.1) > 0.1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_trunks_watch_wheels_and_gyro(seed: int) -> None:
+    from topograph.localize.slip import SlipWatch
+    from topograph.motion import Leg
+
+    rng = np.random.default_rng(seed)
+    trees = rng.uniform(-25, 25, (70, 2))
+
+    def drive(wheels: float, gyro: float) -> tuple[float, float]:
+        watch, x, y, yaw = SlipWatch(), -15.0, 0.0, 0.0
+        blind = doubted = 0
+        for _ in range(100):
+            x, y, yaw = x + 0.1 * np.cos(yaw), y + 0.1 * np.sin(yaw), yaw + 0.02
+            R = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+            seen = (trees - [x, y]) @ R + rng.normal(0, 0.03, trees.shape)
+            leg = Leg(
+                step=np.array([0.1 * wheels, 0.0, 0.02 * gyro]), distance=0.1 * wheels, turned=0.02 * gyro, seconds=0.1
+            )
+            out = watch.check(seen[rng.random(len(seen)) < 0.8], leg)
+            blind += out.blind > 0
+            doubted += out.rate_sigma > 0
+        return blind / 100, doubted / 100
+
+    assert max(drive(1.0, 1.0)) <= 0.02
+    assert drive(1.05, 1.0)[0] <= 0.1
+    assert drive(0.0, 1.0)[0] > 0.9
+    assert drive(3.0, 1.0)[0] > 0.9
+    assert drive(-1.0, 1.0)[0] > 0.9
+    assert drive(1.0, 0.0)[1] > 0.8
+    assert drive(1.0, 1.3)[1] > 0.5

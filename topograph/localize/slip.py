@@ -22,7 +22,9 @@ TURN, TURN_SHARE = 0.03, 0.1
 SPREAD = 0.05
 """Least deviation of a trunk between two scans, m."""
 LEGS = (3, 15)
-"""Over so many legs it is judged: what is seen of the same trunks adds up, their noise does not."""
+FRESH = 0.3
+"""Over so many legs it is judged: what is seen of the same trunks adds up, and their noise does not, but for such a share of the
+trunks that are new in each scan."""
 WIDER = 1.5
 """A rate that is wrong is doubted by so much of what it is off by."""
 
@@ -53,8 +55,9 @@ class SlipWatch:
         # Suffixes of the last legs, from the third on.
         rows = np.array(self._rows)[::-1]
         sums, least = np.cumsum(rows, axis=0)[LEGS[0] - 1 :], rows[LEGS[0] - 1 :]
-        place = np.maximum(np.maximum(OFF, SHARE * sums[:, 3]), SIGMAS * np.maximum(rows[0, 5], least[:, 5]))
-        turn = np.maximum(np.maximum(TURN, TURN_SHARE * sums[:, 4]), SIGMAS * np.maximum(rows[0, 6], least[:, 6]))
+        grown = SIGMAS * np.sqrt(1.0 + FRESH * np.arange(LEGS[0], len(rows) + 1))
+        place = np.maximum(np.maximum(OFF, SHARE * sums[:, 3]), grown * np.maximum(rows[0, 5], least[:, 5]))
+        turn = np.maximum(np.maximum(TURN, TURN_SHARE * sums[:, 4]), grown * np.maximum(rows[0, 6], least[:, 6]))
         if (np.hypot(*sums[:, :2].T) > place).any():
             leg = replace(leg, blind=leg.seconds)
         wrong = np.abs(sums[:, 2]) > turn

@@ -11,10 +11,11 @@ from factors.imu import ImuNoise, bias_walk, preintegrate, preintegrated
 from factors.noise import Kernel, gaussian, robust, sigmas
 from factors.odometry import odometries, odometry, odometry_2d
 from factors.pose import from_pose3, to_pose3, to_pose3s
-from factors.ranging import range_2d
+from factors.ranging import MEASURES, range_2d, sighting_2d
 from factors.trunk import bearing_basis, trunk, trunk_2d, trunk_linear, trunk_residual, trunks
 
 __all__ = [
+    "MEASURES",
     "ImuNoise",
     "Kernel",
     "bearing_basis",
@@ -32,6 +33,7 @@ __all__ = [
     "preintegrated",
     "range_2d",
     "robust",
+    "sighting_2d",
     "sigmas",
     "to_pose3",
     "to_pose3s",

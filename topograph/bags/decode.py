@@ -11,6 +11,8 @@ from topograph.bags.messages import Array, Fix, Heading, Imu, Odometry, Trunks
 from topograph.bags.scan import decode as decode_scan
 from topograph.geometry import from_quaternion
 
+SHORTEST, LONGEST = 1e-6, 1e3
+"""Components of a quaternion that is meant."""
 FARTHEST = 1e5
 """Of a trunk from its sensor, m: beyond, the number is none."""
 
@@ -113,7 +115,8 @@ def decode_trunks(m: Any) -> Trunks:
             diameter[i] = d.bbox.size.x
         if d.results:
             score[i] = _log_odds(d.results[0])
-    quaternion[~(np.linalg.norm(quaternion, axis=1) > 1e-6)] = (0, 0, 0, 1)
+    none = ~(np.abs(quaternion).max(axis=1, initial=0.0) < LONGEST)  # True for NaN
+    quaternion[none | (np.abs(quaternion).max(axis=1, initial=0.0) < SHORTEST)] = (0, 0, 0, 1)
     axis = from_quaternion(np.zeros((n, 3)), quaternion)[:, :3, 2] if n else np.zeros((0, 3))
     axis[axis[:, 2] < 0] *= -1.0
     return _trunks(m, p, axis, diameter, score)

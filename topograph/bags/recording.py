@@ -223,6 +223,7 @@ class Recording:
         """Count what the index announces and the file did not give."""
         if self.counts[topic] > self.given[kind]:
             self.skipped[f"{kind}: {DAMAGED}"] += self.counts[topic] - self.given[kind]
+        self.counts[topic] = max(self.counts[topic], self.given[kind])  # reading in sequence may find more
 
     def _raw(
         self, i: int, names: set[str], window_ns: tuple[int, int] | None
@@ -238,6 +239,8 @@ class Recording:
             given, at_last = at_last, Counter()
             try:
                 for connection, log_ns, raw in reader.messages(connections=found, start=last, stop=stop):
+                    if not isinstance(log_ns, int):  # a row of SQLite may hold anything
+                        raise TypeError(f"time of recording {log_ns!r}")
                     if log_ns == last and given[connection.topic]:
                         given[connection.topic] -= 1
                         at_last[connection.topic] += 1
@@ -274,7 +277,8 @@ class Recording:
                 return self._finite_imu(decode.unpack_imu(raw, reader.is2))
             if kind == "odometry":
                 odometry = decode.unpack_odometry(raw, reader.is2)
-                if not _sane(odometry.odom_T_child) or not _sane(odometry.twist) or not odometry.odom_T_child[3:].any():
+                turn = np.abs(odometry.odom_T_child[3:]).max()
+                if not _sane(odometry.odom_T_child) or not _sane(odometry.twist) or turn < decode.SHORTEST:
                     self._count("odometry: not finite")
                     return None
                 return odometry

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +37,9 @@ class LocalizeConfig:
         degraded: standard deviation of the position above which tracking is called degraded.
         along, across, step, yaw_gyro, yaw_rate, yaw_wheels, yaw_distance: noise of dead reckoning; shares of the distance
             and of the turn, m a step, rad/√s with a gyro, rad/√m without.
+        estimator: what estimates the pose while tracking: "graph", a fixed-lag smoother (localize/hypothesis.py), or "filter", the
+            one that associates.
+        measure: what of a trunk the graph takes: "both", "ranges" (as the thesis does) or "bearings".
         planar_tilt: deviation of roll and pitch where no IMU holds them.
     """
 
@@ -73,3 +77,5 @@ class LocalizeConfig:
     yaw_wheels: float = 0.08
     yaw_distance: float = 0.01
     planar_tilt: float = 0.06
+    estimator: Literal["graph", "filter"] = "graph"
+    measure: Literal["both", "ranges", "bearings"] = "both"

@@ -12,6 +12,7 @@ from topograph.geometry import Array
 from topograph.localize.config import LocalizeConfig
 from topograph.localize.evidence import Posterior, describe, nothing, weigh
 from topograph.localize.filter import Filter
+from topograph.localize.hypothesis import Hypothesis
 from topograph.localize.index import MapIndex
 from topograph.localize.search import Found, search
 from topograph.localize.submap import BINS, Move, Submap, Sweep, Visibility, absorb, assign, in_reach, in_view, sectors
@@ -77,6 +78,7 @@ class Engine:
         self.visibility = Visibility(config)
         self.hunt = _Hunt(Submap(config, self.visibility))
         self.track: Filter | None = None
+        self.graph: Hypothesis | None = None
         self.state = "searching"
         self.risk = 1.0
         self.sums = np.zeros(2)
@@ -102,6 +104,8 @@ class Engine:
             self._lose(sweep)
             return self._belief(NO_PAIRS)
         pairs = self._follow(self.track, sweep)
+        if self.graph is not None:
+            self.graph.step(move, sweep, pairs)
         self._shadow()
         if self.sums[0] > self.config.lost or self.sums[1] > self.config.slip:
             self._lose(sweep)
@@ -156,6 +160,10 @@ class Engine:
         h = self.hunt
         self.track = anchored(h, self.index, self.config)
         self.risk = h.posterior.risk
+        self.graph = None
+        if self.config.estimator == "graph":
+            f, var = self.track, self.index.var + self.config.map_sigma**2
+            self.graph = Hypothesis(f.mean[:3], f.cov[:3, :3], self.index.xy, var, self.config)
         self.state = "tracking"
         self.sums[:] = 0.0
         self._met[:] = 0.0
@@ -285,7 +293,7 @@ class Engine:
 
     def _lose(self, sweep: Sweep) -> None:
         """The evidence has turned: forget the pose and begin with this scan."""
-        self.track = None
+        self.track = self.graph = None
         self.state = "lost"
         self.risk = 1.0
         self.losses += 1
@@ -299,8 +307,10 @@ class Engine:
     def _belief(self, pairs: NDArray[np.int64]) -> Belief:
         f = self.track
         if f is not None:
-            pose = f.mean[:3].copy()
-            return Belief(self.state, pose, f.cov[:3, :3].copy(), 1, self.risk, pose[None], np.ones(1), pairs)
+            pose, cov = f.mean[:3].copy(), f.cov[:3, :3].copy()
+            if self.graph is not None:
+                pose, cov = self.graph.pose.copy(), self.graph.cov.copy()
+            return Belief(self.state, pose, cov, 1, self.risk, pose[None], np.ones(1), pairs)
         p = self.hunt.posterior
         n = 0
         if len(p.p) and p.p.sum() > 0:

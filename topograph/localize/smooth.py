@@ -8,7 +8,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from factors import sighting_2d
 from topograph.geometry import Array, from_xyz_rpy, yaw_of
+from topograph.localize.hypothesis import HUBER
 from topograph.localize.method import Fix
 from topograph.localize.submap import Move, Sweep
 
@@ -50,15 +52,7 @@ def smooth(
                         _L(t), trees[t], gtsam.noiseModel.Isotropic.Sigma(2, float(np.sqrt(var[t])))
                     )
                 )
-            p, C = sweeps[k].p[i], sweeps[k].cov[i]
-            reach = float(np.hypot(*p))
-            line = p / reach
-            side = np.array([-line[1], line[0]])
-            sigma = np.sqrt([side @ C @ side / reach**2, line @ C @ line])
-            huber = gtsam.noiseModel.Robust.Create(
-                gtsam.noiseModel.mEstimator.Huber.Create(2.0), gtsam.noiseModel.Diagonal.Sigmas(sigma)
-            )
-            graph.add(gtsam.BearingRangeFactor2D(_X(k), _L(t), gtsam.Rot2(float(np.arctan2(p[1], p[0]))), reach, huber))
+            graph.add(sighting_2d(_X(k), _L(t), sweeps[k].p[i], sweeps[k].cov[i], HUBER))
     result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     out = []
     for k, fix in enumerate(fixes):

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from io import BytesIO
 
 from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 from mcap.records import Channel as ChannelRecord
 from mcap.records import Chunk, Schema
 from mcap.stream_reader import get_chunk_data_stream
@@ -105,6 +106,13 @@ class McapBlocks:
         return len(self.data)
 
     def _learn(self, op: int, raw: bytes) -> None:
+        """Take in a schema or a channel; a damaged one is passed over."""
+        try:
+            self._take_in(op, raw)
+        except (ValueError, struct.error, McapError):
+            self.unread += len(raw)
+
+    def _take_in(self, op: int, raw: bytes) -> None:
         if op == _SCHEMA:
             schema = Schema.read(ReadDataStream(BytesIO(raw)))
             self._schemas[schema.id] = schema

@@ -1,0 +1,131 @@
+"""The graph of one place that survived the search: poses, the map's trees, odometry, and bearings and ranges to the trees.
+
+A fixed-lag smoother over `gtsam.NonlinearFactorGraph`: the last poses stay variables and are linearised anew with every scan, older
+ones are marginalised into a linear factor on what they were tied to. (`gtsam.IncrementalFixedLagSmoother` does the same; its growth
+and its crashes on re-stamped keys are known: gtsam #1452, #1935, #2567.)
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import Kernel, sighting_2d
+from topograph.geometry import Array
+from topograph.localize.config import LocalizeConfig
+from topograph.localize.submap import Move, Sweep
+
+_X, _L = gtsam.symbol_shorthand.X, gtsam.symbol_shorthand.L
+LAG, OLDEST = 10, 5
+"""Poses that stay variables, at least; so many more, and they are marginalised at once."""
+STEPS = 2
+"""Gauss-Newton steps a scan: the last scan's solution is near."""
+HUBER = Kernel("huber", 2.0)
+AWAY = 8.0
+"""Trees that are further beyond the view, m, are marginalised: what was learnt of nearer ones is wanted when they are seen again."""
+LEAST = 1e-10
+"""Added to the variances of a step: a robot that stands has none."""
+
+
+class Hypothesis:
+    """Where the robot is, if this place is the right one.
+
+    Args:
+        pose, cov: (3,), (3, 3) of x, y (m) and yaw (rad) in the map when the search ended.
+        trees, var: (T, 2) m and (T,) m² of the map.
+    """
+
+    def __init__(self, pose: Array, cov: Array, trees: Array, var: Array, config: LocalizeConfig) -> None:
+        self.trees, self.var, self.config = trees, var, config
+        self._k = 0
+        self._poses = [0]
+        self._values = gtsam.Values()
+        self._values.insert(_X(0), gtsam.Pose2(*pose))
+        own = _turn(-float(pose[2])) @ cov @ _turn(-float(pose[2])).T + LEAST * np.eye(3)
+        prior = gtsam.PriorFactorPose2(_X(0), gtsam.Pose2(*pose), gtsam.noiseModel.Gaussian.Covariance(own))
+        self._factors: list[Any] = [prior]
+        self._last_seen: dict[int, int] = {}
+        self.pose, self.cov = np.asarray(pose, float).copy(), np.asarray(cov, float).copy()
+
+    def step(self, move: Move, sweep: Sweep, pairs: NDArray[np.int64]) -> None:
+        """One scan further: `move` leads to it, `pairs` (N, 2) are rows of `sweep` and of the map's trees."""
+        noise = gtsam.noiseModel.Gaussian.Covariance(move.cov + LEAST * np.eye(3))
+        step = gtsam.Pose2(*move.step)
+        self._factors.append(gtsam.BetweenFactorPose2(_X(self._k), _X(self._k + 1), step, noise))
+        self._values.insert(_X(self._k + 1), self._values.atPose2(_X(self._k)).compose(step))
+        self._k += 1
+        self._poses.append(self._k)
+        side = self.config.trunk_sigma**2 * np.eye(2)
+        for i, t in pairs.tolist():
+            if t not in self._last_seen:
+                self._values.insert(_L(t), self.trees[t])
+                sigma = float(np.sqrt(self.var[t]))
+                self._factors.append(
+                    gtsam.PriorFactorPoint2(_L(t), self.trees[t], gtsam.noiseModel.Isotropic.Sigma(2, sigma))
+                )
+            self._last_seen[t] = self._k
+            self._factors.append(
+                sighting_2d(_X(self._k), _L(t), sweep.p[i], sweep.cov[i] + side, HUBER, self.config.measure)
+            )
+        self._solve()
+        if len(self._poses) > LAG + OLDEST:
+            self._marginalise()
+
+    def _solve(self) -> None:
+        graph = gtsam.NonlinearFactorGraph()
+        for f in self._factors:
+            graph.push_back(f)
+        order = gtsam.Ordering()
+        for k in self._poses[:-1]:
+            order.push_back(_X(k))
+        for t in self._last_seen:
+            order.push_back(_L(t))
+        order.push_back(_X(self._k))  # last, so that its own conditional is its marginal
+        for _ in range(STEPS):
+            net = graph.linearize(self._values).eliminateSequential(order)
+            self._values = self._values.retract(net.optimize())
+        R = net.at(net.size() - 1).R()
+        inverse = np.linalg.inv(R)
+        last = self._values.atPose2(_X(self._k))
+        self.pose = np.array([last.x(), last.y(), last.theta()])
+        turn = _turn(last.theta())
+        self.cov = turn @ (inverse @ inverse.T) @ turn.T
+
+    def _marginalise(self) -> None:
+        """The oldest poses, and trees that only they saw, become a linear factor on the rest."""
+        old = {_X(k) for k in self._poses[:OLDEST]}
+        first = self._poses[OLDEST]
+        away = self.config.view + AWAY
+        gone = [
+            t
+            for t, k in self._last_seen.items()
+            if k < first and float(np.hypot(*(self.trees[t] - self.pose[:2]))) > away
+        ]
+        old |= {_L(t) for t in gone}
+        mine = [f for f in self._factors if not old.isdisjoint(f.keys())]
+        touched = gtsam.NonlinearFactorGraph()
+        for f in mine:
+            touched.push_back(f)
+        order = gtsam.Ordering()
+        for key in sorted(old):
+            order.push_back(key)
+        _, rest = touched.linearize(self._values).eliminatePartialSequential(order)
+        kept = {id(f) for f in mine}
+        self._factors = [f for f in self._factors if id(f) not in kept]
+        for n in range(rest.size()):
+            if rest.at(n) is not None and rest.at(n).size():
+                self._factors.append(gtsam.LinearContainerFactor(rest.at(n), self._values))
+        for key in old:
+            self._values.erase(key)
+        for t in gone:
+            del self._last_seen[t]
+        del self._poses[:OLDEST]
+
+
+def _turn(yaw: float) -> Array:
+    """(3, 3): a vector of x, y and yaw turned about the vertical."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

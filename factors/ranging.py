@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from factors.noise import Kernel, robust, sigmas
+from factors.trunk import trunk_2d
 
 MEASURES = ("both", "ranges", "bearings")
 
@@ -43,9 +44,7 @@ def sighting_2d(
     of_bearing, of_range = float(np.sqrt(side @ C @ side)) / reach, float(np.sqrt(line @ C @ line))
     bearing = gtsam.Rot2(float(np.arctan2(p[1], p[0])))
     if measure == "both":
-        return gtsam.BearingRangeFactor2D(
-            pose_key, point_key, bearing, reach, robust(sigmas([of_bearing, of_range]), kernel)
-        )
+        return trunk_2d(pose_key, point_key, bearing.theta(), reach, [of_bearing, of_range], kernel)
     if measure == "ranges":
         return range_2d(pose_key, point_key, reach, of_range, kernel)
     if measure == "bearings":

@@ -14,7 +14,7 @@ from topograph.estimate import Headings
 from topograph.estimate.ekf import filtered_path
 from topograph.estimate.inertia import inertia
 from topograph.evaluate import Metric, Truth, map_metrics
-from topograph.evaluate.localization import localization_errors
+from topograph.evaluate.localization import localization_errors, path_errors
 from topograph.evaluate.metrics import match
 from topograph.geometry import Array, Datum, interpolate, inverse, planar, transform, wrap, yaw_of
 from topograph.motion import Inertial
@@ -282,10 +282,7 @@ def test_poses_of_a_later_run_are_as_sure_as_is_said(rtk: list[Mapped], folder: 
                 assert np.sort([r.along**2, r.across**2])[1] <= spread[1] + 1e-3
         nees.append(errors.nees.mean())
         live.append(np.linalg.norm(errors.xy, axis=1).mean())
-        stamps, poses = replay.smoothed
-        true = interpolate(truth.stamps_ns, truth.world_T_robot, stamps)[:, :3, 3]
-        off = poses[:, :2, 3] - m.topo.datum.to_enu(truth.datum.to_geodetic(true))[:, :2]
-        smoothed.append(np.linalg.norm(off, axis=1).mean())
+        smoothed.append(path_errors(*replay.smoothed, truth, m.topo.datum).mean())
     assert 0.3 < np.mean(nees) < 4.5
     assert np.mean(live) < 0.04
     assert np.mean(smoothed) < 0.95 * np.mean(live)

@@ -34,6 +34,8 @@ from topograph.errors import UsageError
 @click.option(
     "--risk", type=click.FloatRange(1e-9, 0.5), default=None, help="Chance of a wrong pose that is accepted (1e-4)."
 )
+@click.option("--measure", type=click.Choice(["both", "ranges", "bearings"]), default=None,
+              help="What the graph takes of a trunk while tracking: bearing and range (both), or one of them; the thesis has ranges.")  # fmt: skip
 @click.option("--from", "from_s", type=float, default=0.0, help="Begin so many seconds into the recording.")
 @click.option("--to", "to_s", type=float, default=float("inf"), help="End there.")
 @click.option("--results", type=click.Path(path_type=Path), help="Folder for poses, table, report and configuration.")
@@ -41,14 +43,15 @@ from topograph.errors import UsageError
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 @input_options
 def localize(
-    map_file: Path, bags: tuple[Path, ...], method: str, risk: float | None, from_s: float, to_s: float, results: Path | None,
+    map_file: Path, bags: tuple[Path, ...], method: str, risk: float | None, measure: str | None, from_s: float, to_s: float, results: Path | None,
     truth: Path | None, quiet: bool, config_file: Path | None, **words: Any,
 ) -> None:  # fmt: skip
     """Find the robot of BAGS (one run) in MAP, from anywhere, without GNSS; no pose is given where it is not sure."""
     from topograph import pipeline, store
     from topograph.config import dump
     from topograph.evaluate import write_tum
-    from topograph.evaluate.localization import localization_errors, localization_metrics
+    from topograph.evaluate.localization import localization_errors, localization_metrics, path_errors
+    from topograph.evaluate.metrics import Metric
     from topograph.report import localization_error_figure, localization_figure, write_json, write_page
     from topograph.report.record import write_text
 
@@ -57,6 +60,8 @@ def localize(
     config = config_of(config_file, words)
     if risk is not None:
         config = replace(config, localize=replace(config.localize, risk=risk))
+    if measure is not None:
+        config = replace(config, localize=replace(config.localize, measure=measure))
     true = truth_of(truth)
     topo = store.load(map_file, clouds=method != "graph")
     if true is not None and topo.datum is None:
@@ -70,6 +75,9 @@ def localize(
                 other = pipeline.localize_bags(topo, bags, config, "thesis", progress, (from_s, to_s))
         errors = None if true is None or topo.datum is None else localization_errors(run.reports, true, topo.datum)
         metrics = localization_metrics(run.reports, run.distance, run.update_ms, errors)
+        if true is not None and topo.datum is not None and len(run.smoothed[0]):
+            off = path_errors(*run.smoothed, true, topo.datum)
+            metrics.append(Metric("smoothed: position error mean", float(off.mean()), "m", "lower"))
         by_method = {} if errors is None else {first: errors}
         if other is not None:
             theirs = (
@@ -103,6 +111,7 @@ def localize(
         facts = {
             "map": map_file.name,
             "method": method,
+            "measure": config.localize.measure,
             "recorded": f"{run.duration_s:.0f} s",
             "topograph": __version__,
         }

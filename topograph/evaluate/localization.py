@@ -44,6 +44,12 @@ def localization_errors(reports: Sequence[Report], truth: Truth, datum: Datum) -
     return LocalizationErrors(stamps, error[:, :2], error[:, 2], wrap(yaw_of(poses) - yaw_of(world_T_robot)), nees)
 
 
+def path_errors(stamps_ns: Stamps, poses: Array, truth: Truth, datum: Datum) -> Array:
+    """Horizontal distances (K,) of poses (K, 4, 4) in the map's frame at `datum` from the truth's path, m."""
+    true = interpolate(truth.stamps_ns, truth.world_T_robot, stamps_ns)[:, :3, 3]
+    return np.asarray(np.linalg.norm((poses[:, :3, 3] - datum.to_enu(truth.datum.to_geodetic(true)))[:, :2], axis=1))
+
+
 def localization_metrics(
     reports: Sequence[Report], distance: Sequence[float], update_ms: Sequence[float], errors: LocalizationErrors | None
 ) -> list[Metric]:

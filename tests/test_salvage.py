@@ -212,3 +212,165 @@ def test_a_rosbag_whose_last_chunk_was_never_closed(recordings: dict[str, Path],
     (tmp_path / "killed.bag").write_bytes(data)
     _, used = read(tmp_path / "killed.bag")
     assert used.total() == n
+
+
+def test_names_and_kinds(recordings: dict[str, Path], tmp_path: Path) -> None:
+    """Another format's suffix inside a name, and characters that mean something in an address."""
+    data = recordings["zstd.mcap"].read_bytes()
+    (tmp_path / "field.bag.mcap").write_bytes(data[: len(data) // 2])
+    assert read(tmp_path / "field.bag.mcap")[1].total() > 200
+    whole_db = recordings["rows.db3"].read_bytes()
+    (tmp_path / "run1.db3").write_bytes(whole_db)
+    (tmp_path / "run%31.db3").write_bytes(whole_db[: len(whole_db) // 2])
+    assert read(tmp_path / "run1.db3")[1].total() == 540
+    assert 200 < read(tmp_path / "run%31.db3")[1].total() < 300
+    (tmp_path / "a b%41#?.db3").write_bytes(whole_db)
+    r, used = read(tmp_path / "a b%41#?.db3", strict=True)
+    assert used.total() == 540
+    assert not r.notes
+
+
+def test_the_last_part_of_a_run_may_be_empty(recordings: dict[str, Path], tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    shutil.copy(recordings["none.mcap"], folder / "run_0.mcap")
+    (folder / "run_1.mcap").write_bytes(b"")
+    (folder / "metadata.yaml").write_text("nothing: here")
+    r, used = read(folder)
+    assert used.total() == 540
+    assert any("left out" in n and "run_1.mcap" in n for n in r.notes)
+    with pytest.raises(InputError, match="given twice"):
+        read_all([folder, folder / "run_0.mcap"])
+
+
+def read_all(paths: list[Path]) -> None:
+    with Recording(paths) as r:
+        list(r.messages())
+
+
+def test_messages_in_a_journal_are_read(recordings: dict[str, Path], tmp_path: Path) -> None:
+    """rosbag2's resilient profile: killed, half of the messages are in the write-ahead log."""
+    path = tmp_path / "run.db3"
+    shutil.copy(recordings["rows.db3"], path)
+    with sqlite3.connect(path) as db:
+        rows = db.execute("SELECT topic_id, timestamp, data FROM messages WHERE id > 300").fetchall()
+        db.execute("DELETE FROM messages WHERE id > 300")
+    db.close()
+    db = sqlite3.connect(path)
+    db.execute("PRAGMA journal_mode=WAL")
+    db.execute("PRAGMA wal_autocheckpoint=0")
+    with db:
+        db.executemany("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", rows)
+    killed = tmp_path / "killed"
+    killed.mkdir()
+    for p in (path, path.with_name("run.db3-wal")):
+        shutil.copy(p, killed)
+    db.close()
+    before = (killed / "run.db3").read_bytes()
+    r, used = read(killed / "run.db3")
+    assert used.total() == 540
+    assert any("was not closed" in n for n in r.notes)
+    assert (killed / "run.db3").read_bytes() == before  # read-only
+    with pytest.raises(InputError, match="--strict"):
+        read(killed / "run.db3", strict=True)
+
+
+def test_sqlite_says_how_many_are_lost_and_survives_its_page_size(recordings: dict[str, Path], tmp_path: Path) -> None:
+    data = bytearray(recordings["rows.db3"].read_bytes())
+    data[16:18] = (8192).to_bytes(2, "big")
+    data[40 * 4096 : 60 * 4096] = bytes(20 * 4096)
+    (tmp_path / "x.db3").write_bytes(data)
+    r, used = read(tmp_path / "x.db3")
+    lost = 540 - used.total()
+    assert 0 < lost < 60
+    assert any(f"{lost} messages that the numbers of the others tell of" in n for n in r.notes), r.notes
+
+
+def test_a_flipped_time_costs_its_message(tmp_path: Path, recordings: dict[str, Path]) -> None:
+    """Of a message outside of chunks: the recording does not become one of centuries, and a broken length costs little."""
+    path = tmp_path / "bare.mcap"
+    with AnyReader([recordings["none.mcap"]]) as r, path.open("wb") as f:
+        w = McapWriter(f, use_chunking=False)
+        w.start("ros2")
+        ids = {}
+        for c in r.connections:
+            text, _ = r.typestore.generate_msgdef(c.msgtype, ros_version=2)
+            ids[c.id] = w.register_channel(c.topic, "cdr", w.register_schema(c.msgtype, "ros2msg", text.encode()))
+        for c, t, raw in r.messages():
+            w.add_message(ids[c.id], t, bytes(raw), t)
+        w.finish()
+    data = path.read_bytes()
+    found = [
+        k
+        for k in range(len(data) - 40)
+        if data[k] == 5 and int.from_bytes(data[k + 15 : k + 23], "little") // 10**9 == T0 // 10**9
+    ]
+    assert len(found) > 20
+    for bit in (62, 63, 52):
+        broken = bytearray(data[: int(0.95 * len(data))])
+        broken[found[5] + 15 + bit // 8] ^= 1 << bit % 8
+        (tmp_path / "b.mcap").write_bytes(broken)
+        r2, used = read(tmp_path / "b.mcap")
+        assert r2.duration_s < 25
+        assert used.total() > 480
+    broken = bytearray(data[: int(0.95 * len(data))])
+    broken[found[5] + 2] ^= 0x40  # its length
+    (tmp_path / "b.mcap").write_bytes(broken)
+    assert read(tmp_path / "b.mcap")[1].total() > 480
+
+
+def test_ros1_messages_in_mcap(recordings: dict[str, Path], tmp_path: Path) -> None:
+    path = tmp_path / "ros1.mcap"
+    with AnyReader([recordings["none.bag"]]) as r, path.open("wb") as f:
+        w = McapWriter(f)
+        w.start("ros1")
+        ids = {}
+        for c in r.connections:
+            text, _ = r.typestore.generate_msgdef(c.msgtype, ros_version=1)
+            name = c.msgtype.replace("/msg/", "/")
+            ids[c.id] = w.register_channel(c.topic, "ros1", w.register_schema(name, "ros1msg", text.encode()))
+        for c, t, raw in r.messages():
+            w.add_message(ids[c.id], t, bytes(raw), t)
+        w.finish()
+    r2, used = read(path)
+    assert used.total() == 540
+    assert not r2.skipped
+
+
+def test_small_files_do_not_become_large(tmp_path: Path) -> None:
+    """A chunk of a few hundred bytes that unpacks to gigabytes, a chain of pages that bites its tail, and junk between records."""
+    import bz2
+    import tracemalloc
+
+    def field(name: bytes, value: bytes) -> bytes:
+        return (len(name) + 1 + len(value)).to_bytes(4, "little") + name + b"=" + value
+
+    def record(fields: bytes, data: bytes) -> bytes:
+        return len(fields).to_bytes(4, "little") + fields + len(data).to_bytes(4, "little") + data
+
+    packed = bz2.compress(bytes(10**9))
+    chunk = record(
+        field(b"compression", b"bz2") + field(b"op", b"\x05") + field(b"size", (100).to_bytes(4, "little")), packed
+    )
+    (tmp_path / "bomb.bag").write_bytes(b"#ROSBAG V2.0\n" + chunk * 3)
+    head = bytearray(4096)
+    head[:16], head[16:18] = b"SQLite format 3\0", (4096).to_bytes(2, "big")
+    leaf = bytearray(4096)
+    leaf[0], leaf[3:5], leaf[5:7], leaf[8:10] = (
+        0x0D,
+        (1).to_bytes(2, "big"),
+        (100).to_bytes(2, "big"),
+        (100).to_bytes(2, "big"),
+    )
+    leaf[100:106] = bytes([0x81, 0x80, 0x80, 0x80, 0x00, 0x01])  # 2^28 bytes
+    leaf[4092:4096] = (3).to_bytes(4, "big")
+    loop = (3).to_bytes(4, "big") + bytes(4092)
+    (tmp_path / "loop.db3").write_bytes(bytes(head + leaf) + loop)
+    message = record(field(b"conn", bytes(4)) + field(b"op", b"\x02") + field(b"time", bytes(8)), b"x")
+    (tmp_path / "junk.bag").write_bytes(b"#ROSBAG V2.0\n" + (message + b"\x01") * 30_000)
+    tracemalloc.start()
+    for name in ("bomb.bag", "loop.db3", "junk.bag"):
+        with pytest.raises(InputError, match="no message"):
+            Salvaged(tmp_path / name)
+    assert tracemalloc.get_traced_memory()[1] < 1e8
+    tracemalloc.stop()

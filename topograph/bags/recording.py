@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import heapq
 import logging
+import shutil
+import sqlite3
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any, Self, cast
 
@@ -58,6 +61,7 @@ class Recording:
 
     def __init__(self, paths: Sequence[Path], config: BagsConfig | None = None) -> None:
         self.paths = [q for p in paths for q in _resolve(Path(p))]
+        _refuse_twice(self.paths)
         self.config = config or BagsConfig()
         self.skipped: Counter[str] = Counter()
         self.frames = Frames(self.config.base_frame, self.config.extrinsics)
@@ -92,36 +96,76 @@ class Recording:
         """Open the files; folders that do not open as such are replaced by the files in them, files by what can be salvaged."""
         waiting, self.paths = self.paths, []
         for path in waiting:
-            opened: list[tuple[Path, Reader]]
             try:
-                opened = [(path, _open(path))]
+                self._take(path, self._open(path))
+                continue
             except Exception as err:  # whatever the readers' libraries raise on damage
-                why = f"{path}: {why_unreadable(path, err)}"
+                why, cause = f"{path}: {why_unreadable(path, err)}", err
                 if self.config.strict:
                     raise InputError(f"{why}; without --strict what is whole in it is read") from err
-                files = recordings_in(path) if path.is_dir() else [path]
-                if not files:
-                    raise InputError(why) from err
-                opened = [(p, self._salvage(p, None if path.is_dir() else err)) for p in files]
-                if path.is_dir():
-                    self.notes.append(f"{path.name}: metadata.yaml does not fit ({err}); its files are read one by one")
-            for p, reader in opened:
-                self._stack.callback(reader.close)
-                self._readers.append(reader)
-                self.paths.append(p)
+            if path.is_file():
+                self._take(path, self._salvage(path, cause))
+                continue
+            files, refused = recordings_in(path), []
+            for p in files:  # the last part of a run that ended with the power may be empty
+                try:
+                    self._take(p, self._whole_or_salvaged(p))
+                except InputError as err:
+                    refused.append(str(err))
+            if len(refused) == len(files):
+                raise InputError("; ".join([why, *refused]))
+            self.notes.append(f"{path.name}: metadata.yaml does not fit ({cause}); its files are read one by one")
+            self.notes += [f"left out: {r}" for r in refused]
 
-    def _salvage(self, path: Path, err: Exception | None) -> Reader:
-        """The file, if it opens; otherwise what is whole in it."""
-        if err is None:
-            try:
-                return _open(path)
-            except Exception as own:  # noqa: BLE001  # whatever the readers' libraries raise on damage; told below
-                err = own
+    def _take(self, path: Path, reader: Reader) -> None:
+        self._stack.callback(reader.close)
+        self._readers.append(reader)
+        self.paths.append(path)
+
+    def _open(self, path: Path) -> AnyReader:
+        """The file by its index; raises whatever the readers' libraries do on damage."""
+        if path.suffix == ".active":
+            raise ValueError("it was never closed")
+        beside = [q for q in side_files(path) if q.stat().st_size]
+        if beside:
+            if self.config.strict:
+                raise ValueError(f"{beside[0].name} holds messages that were never written into it")
+            path = self._joined(path, beside)
+        elif path.suffix == ".db3" and set("%?#") & set(str(path)):  # rosbags hands the name on as an address
+            link = self._folder() / "recording.db3"
+            link.symlink_to(path.resolve())
+            path = link
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader.open()
+        return reader
+
+    def _folder(self) -> Path:
+        return Path(self._stack.enter_context(TemporaryDirectory(prefix="topograph-")))
+
+    def _joined(self, path: Path, beside: Sequence[Path]) -> Path:
+        """A copy of an SQLite file with what its journal holds: SQLite would write it into the recording itself."""
+        copy = self._folder() / "recording.db3"
+        shutil.copyfile(path, copy)
+        for q in beside:
+            shutil.copyfile(q, copy.with_name(copy.name + q.name.removeprefix(path.name)))
+        with closing(sqlite3.connect(copy)) as db:
+            db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            db.execute("PRAGMA journal_mode=DELETE")
+        self.notes.append(f"{path.name}: was not closed; what {beside[0].name} holds was joined with it in a copy")
+        return copy
+
+    def _whole_or_salvaged(self, path: Path) -> Reader:
+        try:
+            return self._open(path)
+        except Exception as err:  # noqa: BLE001  # whatever the readers' libraries raise on damage; told below
+            return self._salvage(path, err)
+
+    def _salvage(self, path: Path, err: Exception) -> Salvaged:
+        """What is whole in the file."""
         saved = Salvaged(path)
         lost = f"not read: {saved.lost}" if saved.lost else "nothing else was found in it"
-        why = "never closed" if path.suffix == ".active" else str(err) or type(err).__name__
         self.notes.append(
-            f"{path.name}: truncated, damaged or never closed ({why}): {saved.message_count} messages "
+            f"{path.name}: truncated, damaged or of an unusual kind ({str(err) or type(err).__name__}): {saved.message_count} messages "
             f"({(saved.end_time - saved.start_time) * 1e-9:.0f} s) were read in sequence; {lost}"
         )
         return saved
@@ -201,6 +245,9 @@ class Recording:
                 message: Any = self._readers[i].deserialize(raw, connection.msgtype)
                 fields = tuple(f.name for f in message.fields)
             yield kind, log_ns, product, fields
+        self.given = Counter({k: seen[k] for k in wanted.values()})
+        for topic, kind in wanted.items():
+            self.count_missing(topic, kind)
 
     def _decoded(self, wanted: dict[str, str], window_ns: tuple[int, int] | None) -> Iterator[Message]:
         """Products in order of recording, stamps as they are; what the index announces and the file does not give is counted."""
@@ -221,6 +268,12 @@ class Recording:
 
     def count_missing(self, topic: str, kind: str) -> None:
         """Count what the index announces and the file did not give."""
+        if self.config.strict and self.counts[topic] != self.given[kind]:
+            raise InputError(
+                f"{topic}: {self.counts[topic]} messages are announced and {self.given[kind]} are there; without --strict those are read"
+            )
+        if self.counts[topic] < self.given[kind]:
+            self.notes.append(f"{topic}: {self.counts[topic]} messages are announced and {self.given[kind]} are there")
         if self.counts[topic] > self.given[kind]:
             self.skipped[f"{kind}: {DAMAGED}"] += self.counts[topic] - self.given[kind]
         self.counts[topic] = max(self.counts[topic], self.given[kind])  # reading in sequence may find more
@@ -317,6 +370,14 @@ def _sane(values: NDArray[np.float64]) -> bool:
     return bool(np.isfinite(values).all() and np.abs(values).max() < 1e9)
 
 
+def _refuse_twice(paths: Sequence[Path]) -> None:
+    """Raise InputError where one recording is named twice: its messages would count double."""
+    inside = [q.resolve() for p in paths for q in ([p] if p.is_file() else recordings_in(p))]
+    for p in inside:
+        if inside.count(p) > 1:
+            raise InputError(f"{p}: is given twice, by itself or with its folder")
+
+
 def _resolve(path: Path) -> list[Path]:
     """The files (or the ROS 2 folder) that a name stands for."""
     if not path.exists():
@@ -330,7 +391,7 @@ def _resolve(path: Path) -> list[Path]:
                 f"{path}: a folder of {len(inside)} bags; name those of one run: {[p.name for p in inside]}"
             )
         return inside
-    if path.is_file() and not _RECORDING & set(path.suffixes):
+    if not path.is_dir() and (not path.is_file() or not _RECORDING & set(path.suffixes)):
         raise InputError(f"{path}: not a recording; give a .bag, a .mcap, a .db3 or a ROS 2 folder")
     return [path]
 
@@ -343,10 +404,7 @@ def recordings_in(folder: Path) -> list[Path]:
     return sorted(p for p in folder.iterdir() if p.is_file() and p.suffix in {*_RECORDING, ".active"})
 
 
-def _open(path: Path) -> AnyReader:
-    """The file by its index; raises whatever the readers' libraries do on damage."""
-    if path.suffix == ".active":
-        raise ValueError("it was never closed")
-    reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-    reader.open()
-    return reader
+def side_files(path: Path) -> list[Path]:
+    """Journals that stand beside an SQLite recording that was not closed."""
+    names = (path.with_name(path.name + end) for end in ("-wal", "-journal"))
+    return [p for p in names if path.suffix == ".db3" and p.is_file()]

@@ -19,6 +19,10 @@ from topograph.errors import InputError
 
 log = logging.getLogger(__name__)
 
+LARGEST = 1 << 62
+"""Times and channels beyond are damaged."""
+LONGEST_NS = 30 * 86_400 * 10**9
+"""From the middle of a recording to its ends."""
 _KEPT = 6
 """Blocks that are kept while messages are given in order of time: chunks of one recording overlap a little."""
 
@@ -46,10 +50,12 @@ class Salvaged:
         if blocks is None:
             raise InputError(f"{path}: neither a ROS 1 bag (version 2.0), nor mcap, nor rosbag2's SQLite")
         self._blocks = blocks
-        self.is2 = self._data[:8] != b"#ROSBAG " and ".bag" not in path.suffixes
         self._recent: OrderedDict[int, list[Entry]] = OrderedDict()
         channel, log_ns, at, row = self._index()
+        self.is2 = blocks.is2
         known = np.isin(channel, list(blocks.channels))
+        if known.any():  # a flipped bit in a time makes a recording of centuries
+            known &= np.abs(log_ns - np.median(log_ns[known])) < LONGEST_NS
         self._homeless = int((~known).sum())
         order = np.argsort(log_ns[known], kind="stable")
         self._channel, self._log_ns, self._at, self._row = (v[known][order] for v in (channel, log_ns, at, row))
@@ -70,7 +76,9 @@ class Salvaged:
         self._broken = 0
         for at in self._blocks.walk():
             try:
-                found += [(c, t, at, n) for n, (c, t, _) in enumerate(self._blocks.load(at))]
+                found += [
+                    (c, t, at, n) for n, (c, t, _) in enumerate(self._blocks.load(at)) if c < LARGEST and t < LARGEST
+                ]
             except Exception as err:  # noqa: BLE001  # whatever decompressors raise on damage; it is counted and said
                 self._broken += 1
                 log.debug("%s: block at %d: %r", self.path, at, err)
@@ -79,10 +87,12 @@ class Salvaged:
 
     @property
     def lost(self) -> str:
+        missing = getattr(self._blocks, "missing", 0)
         parts = [
             f"{self._broken} damaged blocks" if self._broken else "",
             f"{self._blocks.unread} bytes that are no whole record" if self._blocks.unread else "",
-            f"{self._homeless} messages of topics that it does not name" if self._homeless else "",
+            f"{self._homeless} messages of topics that it does not name, or of another year" if self._homeless else "",
+            f"{missing} messages that the numbers of the others tell of" if missing else "",
         ]
         return ", ".join(filter(None, parts))
 

@@ -68,6 +68,8 @@ def map_command(
     unknown = sorted(set(accept) - set(REFUSING))
     if unknown:
         raise UsageError(f"--accept {unknown[0]}: nothing is refused for that; known are {', '.join(REFUSING)}")
+    if not 0.0 <= from_s < to_s:
+        raise UsageError(f"--from {from_s} --to {to_s}: nothing lies between")
     config = config_of(config_file, words)
     true = truth_of(truth)
     with ExitStack() as stack:
@@ -75,6 +77,8 @@ def map_command(
         target = into or output or folder / "map.gpkg"
         if target.suffix != ".gpkg":
             raise UsageError(f"{target}: a map is a GeoPackage; end its name in .gpkg")
+        if target.is_dir():
+            raise UsageError(f"{target}: is a folder; name a file that ends in .gpkg")
         if output is not None and output.exists() and not force:
             raise UsageError(f"{output}: is there already; --force replaces it, --into {output} extends it")
         if into is not None and not into.exists():

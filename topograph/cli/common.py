@@ -8,6 +8,7 @@ import os
 import platform
 import resource
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -169,12 +170,12 @@ def results_folder(folder: Path | None) -> Iterator[Path]:
         part.replace(link)
 
 
-def hash_of(path: Path) -> str:
-    """SHA-256 of a file, or of a folder's files in order of name."""
+def hash_of(path: Path, stop: threading.Event) -> str:
+    """SHA-256 of a file, or of a folder's files in order of name; of what was read until `stop`."""
     h = hashlib.sha256()
     for p in [path] if path.is_file() else sorted(q for q in path.rglob("*") if q.is_file()):
         with p.open("rb") as f:
-            while block := f.read(1 << 22):
+            while not stop.is_set() and (block := f.read(1 << 22)):
                 h.update(block)
     return h.hexdigest()
 
@@ -182,12 +183,13 @@ def hash_of(path: Path) -> str:
 @contextmanager
 def hashed(paths: Sequence[Path]) -> Iterator[Callable[[], list[dict[str, str]]]]:
     """Names and hashes of files, computed beside the reading: what one of the two has read, the other finds in memory."""
+    stop = threading.Event()
     with ThreadPoolExecutor(1) as pool:
-        waiting = [(p.name, pool.submit(hash_of, p)) for p in paths if p.exists()]
+        waiting = [(p.name, pool.submit(hash_of, p, stop)) for p in paths if p.exists()]
         try:
             yield lambda: [{"path": name, "sha256": w.result()} for name, w in waiting]
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)
+            stop.set()  # a command that fails does not wait for it
 
 
 def versions() -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -64,7 +65,8 @@ def inspect(bags: tuple[Path, ...], config_file: Path | None, **words: Any) -> N
         click.echo(f"note: {note}")
     if found.blockers:
         raise InputError("`map` cannot run: " + "; ".join(found.blockers))
-    click.echo(f"`topograph map {' '.join(map(str, bags))}` can run")
+    more = " and the options that were given here" if any(words.values()) or config_file else ""
+    click.echo(f"`topograph map {shlex.join(map(str, bags))}` can run{more}")
 
 
 LONG_S = 100.0

@@ -55,7 +55,7 @@ def localize(
     from topograph.report import localization_error_figure, localization_figure, write_json, write_page
     from topograph.report.record import write_text
 
-    if from_s >= to_s:
+    if not 0.0 <= from_s < to_s:
         raise UsageError(f"--from {from_s} --to {to_s}: nothing lies between")
     config = config_of(config_file, words)
     if risk is not None:

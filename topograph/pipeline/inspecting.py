@@ -12,8 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from topograph.bags import Recording, Scan, StreamSurvey, Survey, Trunks, survey
 from topograph.config import Config
+from topograph.errors import FrameError, InputError
 from topograph.geometry import Array
 from topograph.motion import Streams, StreamsBuilder, align_imu
+from topograph.pipeline.read import refuse_damaged
 
 GAP = {"points": 1.0, "trunks": 2.0, "odometry": 0.5, "imu": 0.2, "fix": 10.0, "heading": 30.0}
 """Silences that are worth a word, s: trunks of the map, wheels and gyro are bridged for less."""
@@ -82,6 +84,10 @@ def inspect_bags(paths: Sequence[Path], config: Config) -> Inspection:
         blockers = _points(roles["points"], roles["trunks"], recording, found)
         _imu(roles["imu"], streams, recording)
         blockers += _fixes(roles["fix"], roles["odometry"], streams)
+        try:
+            refuse_damaged(recording)
+        except InputError as err:
+            blockers.append(str(err))
         used = set(recording.chosen.values())
         return Inspection(
             duration_s=recording.duration_s,
@@ -153,23 +159,26 @@ def _points(points: Role, trunks: Role, recording: Recording, found: Survey) -> 
         ]
     if points.stream is None:
         points.missing = "recorded trunks are used in place of clouds"
-        return []
+        assert trunks.stream is not None
+        return _no_mount(trunks.stream, recording)
     trunks.missing = "clouds are used; --topic-trunks would take recorded ones"
-    if not found.clouds:
+    clouds = [c for c in found.clouds if np.isfinite(c.xyz).all(axis=1).any()]
+    if len(clouds) < len(found.clouds):
+        points.problems.append(
+            f"{len(found.clouds) - len(clouds)} of {len(found.clouds)} clouds that were looked at are empty"
+        )
+    if not clouds:
         return [
             f"{points.stream.topic}: no cloud of it can be decoded ({recording.undecoded.get('points', 'damaged')})"
         ]
-    clouds = found.clouds
     points.facts.append(f"{np.median([len(c.xyz) for c in clouds]):.0f} points of {' '.join(found.fields)}")
     points.facts.append(_times(clouds))
     if clouds[0].offset is None:
         points.problems.append("no time per point: sweeps cannot be deskewed")
-    place = recording.frames.find(points.stream.frame)
-    if place is None:
-        return [
-            f"no transform from {recording.frames.base!r} to {points.stream.frame!r} (known: {', '.join(recording.frames.names()) or 'none'}): "
-            f"add --extrinsic {points.stream.frame}=X,Y,Z,ROLL,PITCH,YAW (metres, radians) or choose --base-frame"
-        ]
+    blockers = _no_mount(points.stream, recording)
+    if blockers:
+        return blockers
+    place = recording.frames.get(points.stream.frame)
     from topograph.trunks.detector import heights_above_ground
     from topograph.trunks.organise import rings_of
 
@@ -179,6 +188,8 @@ def _points(points: Role, trunks: Role, recording: Recording, found: Survey) -> 
         told = clouds[0].ring
         same = np.corrcoef(told, ring)[0, 1] if np.ptp(told) and np.ptp(ring) else 1.0
         order = f"ring field counts from {'below' if same > 0.99 else 'above' if same < -0.99 else 'neither end'}"
+    if not len(tangent):
+        return ["the clouds hold no returns"]
     low, high = np.degrees(np.arctan([tangent.min(), tangent.max()]))
     points.facts.append(f"{len(tangent)} rings, {low:.0f}° to {high:.0f}°; {order}")
     heights = np.array([heights_above_ground(c, place) for c in clouds])
@@ -190,6 +201,15 @@ def _points(points: Role, trunks: Role, recording: Recording, found: Survey) -> 
             points.problems.append("these heights above the ground are not to be believed: check its mounting")
     else:
         points.problems.append("no ground is seen below the LiDAR: check its mounting")
+    return []
+
+
+def _no_mount(stream: StreamSurvey, recording: Recording) -> list[str]:
+    """What keeps trunks from being placed: no way from the base to their sensor."""
+    try:
+        recording.frames.get(stream.frame)
+    except FrameError as err:
+        return [str(err)]
     return []
 
 

@@ -55,9 +55,19 @@ def neighbours(xy: Array, config: TopomapConfig) -> NDArray[np.int64]:
     keep &= distance**2 >= half2 * (1 - 1e-9)
     pairs = pairs[keep]
     length = np.linalg.norm(xy[pairs[:, 0]] - xy[pairs[:, 1]], axis=1)
-    local = np.array([np.median(length[(pairs == i).any(axis=1)]) if (pairs == i).any() else np.inf for i in range(n)])
+    local = _median_by(pairs.ravel(), np.repeat(length, 2), n)
     short = length <= 3.0 * np.maximum(np.minimum(local[pairs[:, 0]], local[pairs[:, 1]]), np.median(length))
     return np.asarray(pairs[short], np.int64)
+
+
+def _median_by(node: NDArray[np.int64], value: Array, n: int) -> Array:
+    """Median (n,) of the values (M,) at each node (M,); infinity where there are none."""
+    order = np.lexsort((value, node))
+    count = np.bincount(node, minlength=n)
+    first = np.cumsum(count) - count
+    ordered = np.append(value[order], np.inf)
+    low, high = first + np.maximum(count - 1, 0) // 2, first + count // 2
+    return np.where(count > 0, 0.5 * (ordered[low] + ordered[high]), np.inf)
 
 
 def _delaunay_pairs(xy: Array) -> NDArray[np.int64]:

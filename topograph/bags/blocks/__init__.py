@@ -22,10 +22,12 @@ class Blocks(Protocol):
 
     Attributes:
         channels: id -> channel, filled by `walk` and `load`.
+        is2: messages are CDR (ROS 2); of mcap, once `walk` has passed.
         unread: bytes passed over, filled by `walk` and `load`.
     """
 
     channels: dict[int, Channel]
+    is2: bool
     unread: int
 
     def walk(self) -> Iterator[int]:
@@ -39,10 +41,12 @@ class Blocks(Protocol):
 
 def blocks_of(data: mmap.mmap, name: str) -> Blocks | None:
     """The reader for a file by its first bytes, or by its name where those are damaged; None for what is no recording."""
-    for magic, suffix, kind in _FORMATS:
-        if data[: len(magic)] == magic or (f".{suffix}" in name and data[: len(magic)] not in _MAGICS):
+    head = data[:_LONGEST_MAGIC]
+    for magic, _, kind in _FORMATS:
+        if head.startswith(magic):
             return kind(data)
-    return None
+    words = name.removesuffix(".active").split(".")
+    return next((kind(data) for _, suffix, kind in _FORMATS if words[-1] == suffix), None)
 
 
 _FORMATS: tuple[tuple[bytes, str, type[RosbagBlocks] | type[McapBlocks] | type[SqliteBlocks]], ...] = (
@@ -50,4 +54,4 @@ _FORMATS: tuple[tuple[bytes, str, type[RosbagBlocks] | type[McapBlocks] | type[S
     (b"\x89MCAP0\r\n", "mcap", McapBlocks),
     (b"SQLite format 3\0", "db3", SqliteBlocks),
 )
-_MAGICS = {m for m, _, _ in _FORMATS}
+_LONGEST_MAGIC = max(len(m) for m, _, _ in _FORMATS)

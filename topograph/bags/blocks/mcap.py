@@ -17,6 +17,7 @@ from topograph.bags.blocks.channel import Channel, Entry
 
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _LAST = 3, 4, 5, 6, 15
 _MAGIC = b"\x89MCAP0\r\n"
+_DAY_NS = 86_400 * 10**9
 _FRAME = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _MESSAGE_HEAD = struct.Struct("<HIQQ")
@@ -28,8 +29,10 @@ class McapBlocks:
     def __init__(self, data: mmap.mmap) -> None:
         self.data = data
         self.channels: dict[int, Channel] = {}
+        self.is2 = True
         self.unread = 0
         self._schemas: dict[int, Schema] = {}
+        self._bare = 0  # time of recording of the first message outside of chunks
 
     def walk(self) -> Iterator[int]:
         at, size = len(_MAGIC), len(self.data)
@@ -40,15 +43,17 @@ class McapBlocks:
             begin, end = at + _FRAME.size, at + _FRAME.size + length
             if op and end <= size and (op != _CHUNK or self._chunk_fits(begin, length)):
                 if op in (_CHUNK, _MESSAGE):
+                    if op == _MESSAGE and length >= _MESSAGE_HEAD.size:
+                        self._bare = self._bare or _MESSAGE_HEAD.unpack_from(self.data, begin)[2]
                     yield at
-                else:
+                elif op in (_SCHEMA, _CHANNEL):
                     self._learn(op, self.data[begin:end])
                 at = end
                 continue
             if op == _CHUNK and self._uncompressed(begin):
                 at = begin + _CHUNK_HEAD.size + 8  # cut, or its length is damaged: its records are read one by one
                 continue
-            following = self._next_chunk(at + 1)
+            following = min(self._next_chunk(at + 1), self._next_message(at + 1))
             self.unread += following - at
             at = following
 
@@ -105,6 +110,21 @@ class McapBlocks:
             at += 1
         return len(self.data)
 
+    def _next_message(self, at: int) -> int:
+        """The next message outside of chunks: of a known channel, and with another record behind it. Only such files are searched."""
+        if not self._bare:
+            return len(self.data)
+        while (at := self.data.find(bytes([_MESSAGE]), at)) >= 0:
+            op, length = self._frame(self.data, at)
+            end = at + _FRAME.size + length
+            if op and _MESSAGE_HEAD.size <= length < len(self.data) and end + _FRAME.size <= len(self.data):
+                channel, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(self.data, at + _FRAME.size)
+                known = channel in self.channels and abs(log_ns - self._bare) < _DAY_NS
+                if known and self._frame(self.data, end)[0]:
+                    return at
+            at += 1
+        return len(self.data)
+
     def _learn(self, op: int, raw: bytes) -> None:
         """Take in a schema or a channel; a damaged one is passed over."""
         try:
@@ -120,8 +140,11 @@ class McapBlocks:
             channel = ChannelRecord.read(ReadDataStream(BytesIO(raw)))
             schema = self._schemas.get(channel.schema_id)
             if schema is not None:
+                self.is2 = channel.message_encoding != "ros1"
+                package, _, name = schema.name.partition("/")
+                typ = schema.name if "/msg/" in schema.name else f"{package}/msg/{name}"
                 text = schema.data.decode(errors="replace")
-                self.channels[channel.id] = Channel(channel.topic, schema.name, text, "idl" in schema.encoding)
+                self.channels[channel.id] = Channel(channel.topic, typ, text, "idl" in schema.encoding)
 
 
 def _message(raw: bytes) -> Entry:

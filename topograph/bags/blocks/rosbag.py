@@ -12,6 +12,8 @@ from topograph.bags.blocks.channel import Channel, Entry
 
 _MESSAGE, _HEADER, _INDEX, _CHUNK, _INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
 _LONGEST_HEADER = 1 << 16
+LARGEST_CHUNK = 1 << 28
+"""Bytes of a chunk when it is decompressed, at most: recorders write less than a thousandth of it."""
 _BEFORE_OP = 64
 """Bytes of a record's header that come before its field `op` at most, where it is looked for without knowing where it begins."""
 
@@ -26,6 +28,7 @@ class RosbagBlocks:
     def __init__(self, data: mmap.mmap) -> None:
         self.data = data
         self.channels: dict[int, Channel] = {}
+        self.is2 = False
         self.unread = 0
 
     def walk(self) -> Iterator[int]:
@@ -44,10 +47,11 @@ class RosbagBlocks:
         if op == _MESSAGE:
             return [(_uint(fields[b"conn"]), _time(fields[b"time"]), raw)]
         compression = fields[b"compression"]
+        size = min(_uint(fields.get(b"size", b"")) or LARGEST_CHUNK, LARGEST_CHUNK)
         if compression == b"bz2":
-            raw = bz2.decompress(raw)
+            raw = bz2.BZ2Decompressor().decompress(raw, size)
         elif compression == b"lz4":
-            raw = lz4.frame.decompress(raw)
+            raw = lz4.frame.LZ4FrameDecompressor().decompress(raw, size)
         out = []
         for _, (op, fields, begin, end) in self._records(raw, 0, (_MESSAGE, _CONNECTION)):
             if op == _MESSAGE:
@@ -58,6 +62,7 @@ class RosbagBlocks:
 
     def _records(self, data: mmap.mmap | bytes, at: int, wanted: tuple[int, ...]) -> Iterator[tuple[int, Record]]:
         """(place, record), passing over what is damaged to the next record with one of the `wanted` ops."""
+        nearest = _Nearest(data, wanted)
         while at < len(data):
             record = _record(data, at)
             if record is not None and record[3] <= len(data):
@@ -67,7 +72,7 @@ class RosbagBlocks:
             if record is not None and record[0] == _CHUNK and record[1].get(b"compression") == b"none":
                 at = record[2]  # cut, or its length is damaged: its messages are read one by one
                 continue
-            following = _next(data, at + 1, wanted)
+            following = nearest.after(at + 1)
             self.unread += following - at
             at = following
 
@@ -111,19 +116,29 @@ def _record(data: mmap.mmap | bytes, at: int) -> Record | None:
     return op, fields, begin, begin + int.from_bytes(data[begin - 4 : begin], "little")
 
 
-def _next(data: mmap.mmap | bytes, at: int, wanted: tuple[int, ...]) -> int:
-    """Where the next whole record with one of the `wanted` ops begins; the end of the data where none does."""
-    nearest = len(data)
-    for op in wanted:
+class _Nearest:
+    """Where whole records with one of some ops begin; every op is looked for once over the data, however often one asks."""
+
+    def __init__(self, data: mmap.mmap | bytes, wanted: tuple[int, ...]) -> None:
+        self.data = data
+        self._known = dict.fromkeys(wanted, -1)
+
+    def after(self, at: int) -> int:
+        """The place of the next one at `at` or later; the end of the data where none is."""
+        for op, known in self._known.items():
+            if known < at:
+                self._known[op] = self._find(op, at)
+        return min(self._known.values())
+
+    def _find(self, op: int, at: int) -> int:
         pattern, found = b"\x04\0\0\0op=" + bytes([op]), at
-        while (found := data.find(pattern, found, nearest)) >= 0:
+        while (found := self.data.find(pattern, found)) >= 0:
             for begin in range(max(at, found - 4 - _BEFORE_OP), found - 3):
-                record = _record(data, begin)
-                if record is not None and record[0] == op and begin + 4 <= found < record[2] and begin < nearest:
-                    nearest = begin
-                    break
+                record = _record(self.data, begin)
+                if record is not None and record[0] == op and begin + 4 <= found < record[2]:
+                    return begin
             found += len(pattern)
-    return nearest
+        return len(self.data)
 
 
 def _uint(value: bytes) -> int:

@@ -12,9 +12,8 @@ from topograph.bags.blocks.channel import Channel, Entry
 
 _HEADER = 100
 _TABLE_LEAF = 0x0D
-_LARGEST = 1 << 30
-"""Bytes of one row, at most: SQLite's own limit."""
-
+_USUAL = 4096
+_PAGES = tuple(2**k for k in range(9, 17))
 Value = int | bytes | float | None
 
 
@@ -24,14 +23,30 @@ class SqliteBlocks:
     def __init__(self, data: mmap.mmap) -> None:
         self.data = data
         page = int.from_bytes(data[16:18], "big")
-        self.page = {1: 65536}.get(page, page)
-        if self.page < 512 or self.page & (self.page - 1):
-            self.page = 4096  # the header is damaged: SQLite's default
+        told = {1: 65536}.get(page, page)
+        # Pages that begin as leaves of tables do are seen at the right size: one flipped bit must not cost the file.
+        self.page = max(_PAGES, key=lambda size: (self._leaves(size), size == told, size == _USUAL))
         self.usable = self.page - (data[20] if len(data) > 20 and data[20] < 64 else 0)
         self.channels: dict[int, Channel] = {}
+        self.is2 = True
         self.unread = 0
+        self.ids: set[int] = set()
         self._definitions: dict[str, tuple[str, bool]] = {}
         self._topics: dict[int, tuple[str, str]] = {}
+
+    def _leaves(self, size: int) -> int:
+        """How many of the pages, were they of this size, begin as a table's leaf with its rows behind it; the first few thousand."""
+        found = 0
+        for at in range(size, min(len(self.data) - 8, 4096 * size), size):
+            if self.data[at] == _TABLE_LEAF:
+                cells, start = (int.from_bytes(self.data[at + k : at + k + 2], "big") for k in (3, 5))
+                found += cells > 0 and 8 + 2 * cells <= (start or 65536) < size
+        return found
+
+    @property
+    def missing(self) -> int:
+        """Rows of `messages` that the numbers of the others say there were."""
+        return max(self.ids) - min(self.ids) + 1 - len(self.ids) if self.ids else 0
 
     def walk(self) -> Iterator[int]:
         for at in range(0, len(self.data) - self.page + 1, self.page):
@@ -50,11 +65,11 @@ class SqliteBlocks:
             try:
                 rowid, row = self._row(at, int.from_bytes(self.data[place : place + 2], "big"))
             except (ValueError, IndexError):
-                self.unread += 1
-                continue
+                continue  # the gap in the rows' numbers tells of it
             match row:
                 case [None | int(), int(topic), int(log_ns), bytes(message)] if log_ns >= 0:
                     out.append((topic, log_ns, message))
+                    self.ids.add(rowid)
                 case [None | int(), bytes(name), bytes(typ), bytes(b"cdr"), *_]:
                     self._topics[rowid] = name.decode(errors="replace"), typ.decode(errors="replace")
                     self._join()
@@ -76,8 +91,8 @@ class SqliteBlocks:
             raise ValueError("a cell outside its page")
         size, at = self._varint(at)
         rowid, at = self._varint(at)
-        if size > _LARGEST:
-            raise ValueError("a row of more than SQLite allows")
+        if size > len(self.data):
+            raise ValueError("a row that is longer than its file")
         payload = self._payload(at, size, page + self.page)
         length, place = _varint(payload, 0)
         kinds = []
@@ -105,10 +120,12 @@ class SqliteBlocks:
         local = local if local <= most else least
         parts, left = [self.data[at : at + local]], size - local
         following = int.from_bytes(self.data[at + local : at + local + 4], "big")
+        passed: set[int] = set()
         while left > 0:
             begin = (following - 1) * self.page
-            if following < 2 or begin + self.page > len(self.data):
+            if following < 2 or begin + self.page > len(self.data) or following in passed:
                 raise ValueError("an overflow page is missing")
+            passed.add(following)
             part = self.data[begin + 4 : begin + 4 + min(left, self.usable - 4)]
             following = int.from_bytes(self.data[begin : begin + 4], "big")
             parts.append(part)

@@ -129,7 +129,9 @@ def one_bag(job: tuple[Path, int, int, Path]) -> tuple[str, int, str, float, flo
             s = run.streams
             used = len(s.odometry_ns) + len(s.imu_ns) + len(s.fix_ns) + len(s.heading_ns) + len(run.trunks)
             missing = announced - used - sum(n for why, n in run.skipped.items() if not why.startswith("tf"))
-            more = missing < 0 and any("sequence" in n for n in run.notes)  # than the damaged index announced
+            more = missing < 0 and any(
+                "sequence" in n or "announced" in n for n in run.notes
+            )  # than the damaged index announced
             said = "read" if missing == 0 or more else f"LOST {missing}"
             if k % 10 == 0:
                 solved = solve_run(run, Config())

@@ -42,6 +42,8 @@ KINDS = (
     "shuffle",
     "dark",
     "stands",
+    "all clocks",
+    "host clock",
 )
 """Words in the names of the faults of tools/faults.py that a live robot can meet."""
 LIVE: dict[str, Fault] = {}
@@ -146,6 +148,21 @@ def _own() -> None:
                 e.it = replace(e.it, odom_T_child=_seven(move @ _matrix(e.it.odom_T_child)))
         bag.events = cut
 
+    def frozen(begin: float, end: float, noise: float) -> Fault:
+        """The scan at `begin` again and again under fresh stamps."""
+
+        def run(bag: Bag, rng: np.random.Generator) -> None:
+            kept = None
+            for e in bag.of("trunks"):
+                if begin <= bag.at(e) < end:
+                    kept = kept or e.it
+                    e.it = replace(kept, stamp_ns=e.it.stamp_ns, p=kept.p + noise * rng.normal(0, 1, kept.p.shape))
+
+        return run
+
+    for seconds in (1.5, 3.0, 1e9):
+        for noise in (0.0, 0.01):
+            LIVE[f"trunks frozen for {seconds:g} s, noise {noise:g} m"] = frozen(25.0, 25.0 + seconds, noise)
     LIVE["scans swapped"] = swapped
     LIVE["an old scan again"] = old
     LIVE["scans twice"] = twice

@@ -10,7 +10,8 @@ NAMES = [
     "no odometry from 20 to 35 s", "no odometry from 30 to 1e+09 s", "no imu from 0 to 1e+09 s", "no trunks from 20 to 35 s",
     "scans swapped", "an old scan again", "odometry arrives 2 s late", "carried", "zero stamps trunks", "one trunks stamp an hour ahead",
     "imu one rate of 1e+300", "imu without gravity", "imu gyro dies half way", "imu gyro scaled by 1.1", "wheels x 0.0 for 6 s", "wheels x 3.0 for 6 s",
-    "odometry frozen", "odometry backwards", "trunks mirrored",
+    "odometry frozen", "odometry backwards", "trunks mirrored", "trunks frozen for 3 s, noise 0.01 m", "trunks frozen for 1e+09 s, noise 0 m",
+    "all clocks jump -5 s half way",
 ]  # fmt: skip
 
 

@@ -137,6 +137,9 @@ class Recording:
             path = link
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
+        if not all(isinstance(c.topic, str) and isinstance(c.msgtype, str) for c in reader.connections):
+            reader.close()
+            raise ValueError("a topic without a name")
         return reader
 
     def _folder(self) -> Path:

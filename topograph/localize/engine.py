@@ -86,10 +86,19 @@ class Engine:
         self._met = np.zeros(2)
         self.losses = 0
 
-    def step(self, move: Move, sweep: Sweep, doubted: Move | None = None) -> Belief:
+    def step(
+        self, move: Move, sweep: Sweep, doubted: Move | None = None, slips: bool = False, blinded: bool = False
+    ) -> Belief:
         """One scan further. Where the trunks say that wheels or gyro are wrong, `doubted` is the motion made wide: a track follows it,
         and its second opinion begins anew. What is searched with stays as stiff as the sensors promise: a world that only fits
-        when it is bent is another one."""
+        when it is bent is another one. `slips`: it is the way that is contradicted; `blinded`: for so long that nobody is
+        believed.
+        """
+        if blinded:
+            if self.track is not None:
+                self._lose(sweep)
+            self.hunt = _Hunt(Submap(self.config, self.visibility))
+            return self._belief(NO_PAIRS)
         if doubted is not None and self.track is not None:
             move, self.hunt = doubted, _Hunt(Submap(self.config, self.visibility))
         self.hunt.submap.step(move, sweep)
@@ -104,6 +113,8 @@ class Engine:
             self._lose(sweep)
             return self._belief(NO_PAIRS)
         pairs = self._follow(self.track, sweep)
+        if slips:
+            self.state = "degraded"
         if self.graph is not None:
             self.graph.step(move, sweep, pairs)
         self._shadow()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
@@ -19,11 +20,15 @@ from topograph.localize.slip import SlipWatch
 from topograph.localize.submap import Move, Sweep
 from topograph.motion import Leg, Reckoner, twist_during, up_at
 from topograph.topomap import TopoMap
-from topograph.trunks import smeared
+from topograph.trunks import none_at, smeared
 
 HEADING_FLOOR = 0.004
 """Least deviation of a heading from trees for learning the gyro's bias, rad: its errors last over many scans."""
 
+log = logging.getLogger(__name__)
+
+UNKNOWN_S = 1.0
+"""Of driving that a clock which was set back hides."""
 CLOCK_SET = 3
 """So many scans in a row that are older than the last one: it is the clock that was set back."""
 
@@ -74,34 +79,47 @@ class Localizer:
             self._heard_ns = m.stamp_ns
         if scan.stamp_ns <= 0 and self._heard_ns > 0:
             scan = replace(scan, stamp_ns=self._heard_ns)  # a driver that does not stamp: the newest message's time
-        if self.report is not None and scan.stamp_ns < self.report.stamp_ns and self._old < CLOCK_SET:
+        if self.report is not None and scan.stamp_ns < self.report.stamp_ns:
             self._old += 1
-            return self.report.fix
-        self._old = 0
+            if self._old < CLOCK_SET:
+                return self.report.fix if self._old == 1 else None
+            self.reckoner.restart(scan.stamp_ns)
+        restarted, self._old = self._old >= CLOCK_SET, 0
         if isinstance(scan, Scan):
             if self._detect is None:
                 raise TypeError("a Localizer that is fed scans needs `detect`")
-            last = scan.stamp_ns + (
-                0 if scan.offset is None or not len(scan.offset) else int(np.nanmax(scan.offset) * 1e9)
-            )
+            timed = scan.offset is not None and bool(np.isfinite(scan.offset).any())
+            last = scan.stamp_ns + (int(np.nanmax(scan.offset) * 1e9) if timed and scan.offset is not None else 0)
             twist, source = twist_during(
                 scan.stamp_ns, last, self._recent_odometry, self._recent_imu, self._robot_R_imu
             )
             up = up_at(scan.stamp_ns, self._recent_odometry, self._recent_imu, self._robot_R_imu)
-            timed = scan.offset is not None
-            scan = self._detect(scan, twist, up)
+            scan = self._seen(scan, twist, up)
             if not timed or source == "none":
                 scan = smeared(scan, twist, source != "none")
         del self._recent_odometry[:-200], self._recent_imu[:-500]
         self.leg = self.reckoner.advance(scan.stamp_ns)
+        if restarted:  # how long it took until the clock was set is not known
+            self.leg = replace(self.leg, blind=UNKNOWN_S, gyro=False)
         self.report = self.method.step(scan, self.leg)
         fix = self.report.fix
+        if getattr(self.method, "contradicted", False):
+            self.reckoner.forget_stretch()
         if fix is not None and np.isfinite(fix.cov[2, 2]):
             x, y = fix.map_T_robot[:2, 3]
             self.reckoner.hold(
                 np.array([x, y, yaw_of(fix.map_T_robot)]), max(float(np.sqrt(fix.cov[2, 2])), HEADING_FLOOR)
             )
         return fix
+
+    def _seen(self, scan: Scan, twist: Array, up: Array | None) -> Trunks:
+        """The trunks of a scan; one that breaks the front end shows nothing."""
+        assert self._detect is not None
+        try:
+            return self._detect(scan, twist, up)
+        except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError) as err:
+            log.warning("the scan of %.3f s broke the front end: %r", scan.stamp_ns * 1e-9, err)
+            return none_at(scan.stamp_ns)
 
 
 class GraphMethod:
@@ -115,6 +133,8 @@ class GraphMethod:
         self._vertical = np.array([0.0, 0.0, 1.0])
         self._row = _row_direction(topo)
         self._slip = SlipWatch()
+        self.contradicted = False
+        self._last_p = np.zeros((0, 3))
 
     def _begin(self, trunks: Trunks) -> Engine:
         """The index is built at the height at which this front end states its trunks."""
@@ -134,6 +154,10 @@ class GraphMethod:
             if not len(trunks):
                 return Report(trunks.stamp_ns, "searching", None, 0, 1.0, np.zeros((0, 3)), *_NONE, np.nan, np.nan)
             self.engine = self._begin(trunks)
+        if len(trunks) and leg.seconds > 0 and np.array_equal(trunks.p, self._last_p):
+            trunks = trunks.select(np.zeros(len(trunks), bool))  # a driver that repeats itself: nothing was seen
+        else:
+            self._last_p = trunks.p
         if not leg.level:
             leg = self._upright(leg, trunks)
         level_T_robot = from_xyz_rpy(0, 0, 0, leg.roll, leg.pitch, 0)
@@ -141,8 +165,14 @@ class GraphMethod:
         watched = self._slip.check(flat, leg)
         self.move = move_of(watched, self.config)
         self.sweep, rows = sweep_of(trunks, level_T_robot, leg, self.config)
-        stiff = move_of(leg, self.config)
-        belief = self.engine.step(stiff, self.sweep, None if watched is leg else self.move)
+        self.contradicted = watched is not leg
+        belief = self.engine.step(
+            move_of(leg, self.config),
+            self.sweep,
+            self.move if self.contradicted else None,
+            self._slip.slips,
+            self._slip.stands,
+        )
         self.sweep_pairs = belief.pairs
         belief = replace(belief, pairs=np.stack([rows[belief.pairs[:, 0]], belief.pairs[:, 1]], axis=1))
         self._rise(leg, belief, trunks, flat)
@@ -196,6 +226,7 @@ class GraphMethod:
         cov[np.ix_([3, 4, 2], [3, 4, 2])] = belief.cov
         cov[np.ix_([5, 0, 1], [5, 0, 1])] = self._tilt_cov
         cov[[0, 1], [0, 1]] += 0.01**2
+        cov[[3, 4], [3, 4]] += self._slip.standing**2
         return Fix(stamp_ns, T, cov, belief.risk)
 
 

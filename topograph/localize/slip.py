@@ -15,12 +15,16 @@ NEAR = 0.8
 """Farthest that a trunk may be from where the wheels expect it, m: half of a close spacing of trees."""
 LEAST = 2
 """Pairs of trunks that tell of motion."""
-OFF, SHARE, SIGMAS = 0.1, 0.35, 4.0
+OFF, SHARE, SIGMAS = 0.12, 0.35, 5.0
 """Trunks that put the robot further from the wheels' place than so many m, such a share of the way and so many deviations of their own."""
 TURN, TURN_SHARE = 0.03, 0.1
 """The same of the gyro's turn, rad."""
+MISSED = 10
+"""Legs without trunks after which what was found of the wheels is forgotten."""
 SPREAD = 0.05
 """Least deviation of a trunk between two scans, m."""
+STANDS = 1.2
+"""Way of the wheels, m, on which trunks that do not move are put down to spinning wheels, and not to a sensor that died."""
 LEGS = (3, 15)
 FRESH = 0.3
 """Over so many legs it is judged: what is seen of the same trunks adds up, and their noise does not, but for such a share of the
@@ -30,13 +34,21 @@ WIDER = 1.5
 
 
 class SlipWatch:
-    """Held before a localizer: where the trunks contradict the wheels, legs are called blind, and turns are doubted (see `Leg`)."""
+    """Held before a localizer: where the trunks contradict the wheels, legs are called blind, and turns are doubted (see `Leg`).
+
+    Attributes:
+        standing: m that the wheels went on while the trunks did not move.
+        slips: the trunks contradict the wheels' way.
+        stands: by the trunks the robot stands, by the wheels it goes, for longer than wheels spin: nobody here can tell who is right.
+    """
 
     def __init__(self) -> None:
+        self.slips = self.stands = False
         self._last: Array | None = None  # (N, 2) of the last scan, levelled robot frame
-        self._rows: list[
-            Array
-        ] = []  # what trunks add to a leg (x, y m, yaw rad), its way and turn, deviations of place and yaw, seconds
+        self._missed = 0
+        self.standing = 0.0
+        # Of each leg: what trunks add to it (x, y m, yaw rad), its way (x, y) and turn, deviations of place and yaw, seconds.
+        self._rows: list[Array] = []
 
     def check(self, flat: Array, leg: Leg) -> Leg:
         """The leg up to a scan whose trunks stand at `flat` (N, 2 or 3), m, in the levelled robot frame."""
@@ -47,22 +59,34 @@ class SlipWatch:
             self._rows = []
             return leg
         found = _residual(last, flat, leg)
-        if found is not None:
-            way = float(np.hypot(*leg.step[:2]))
-            self._rows = [*self._rows, np.array([*found[0], way, abs(leg.step[2]), *found[1], leg.seconds])][-LEGS[1] :]
-        if len(self._rows) < LEGS[0]:
-            return leg
+        if found is None:
+            self._missed += 1
+            if self._missed > MISSED:
+                self._rows, self.standing = [], 0.0
+        else:
+            self._missed = 0
+            told = np.array([*leg.step[:2], abs(leg.step[2]), *found[1], leg.seconds])
+            self._rows = [*self._rows, np.concatenate([found[0], told])][-LEGS[1] :]
+        self.slips = self.stands = False
+        return self._judged(leg, found is not None) if len(self._rows) >= LEGS[0] else leg
+
+    def _judged(self, leg: Leg, seen: bool) -> Leg:
         # Suffixes of the last legs, from the third on.
         rows = np.array(self._rows)[::-1]
         sums, least = np.cumsum(rows, axis=0)[LEGS[0] - 1 :], rows[LEGS[0] - 1 :]
         grown = SIGMAS * np.sqrt(1.0 + FRESH * np.arange(LEGS[0], len(rows) + 1))
-        place = np.maximum(np.maximum(OFF, SHARE * sums[:, 3]), grown * np.maximum(rows[0, 5], least[:, 5]))
-        turn = np.maximum(np.maximum(TURN, TURN_SHARE * sums[:, 4]), grown * np.maximum(rows[0, 6], least[:, 6]))
-        if (np.hypot(*sums[:, :2].T) > place).any():
+        way = np.hypot(*sums[:, 3:5].T)
+        place = np.maximum(np.maximum(OFF, SHARE * way), grown * np.maximum(rows[0, 6], least[:, 6]))
+        turn = np.maximum(np.maximum(TURN, TURN_SHARE * sums[:, 5]), grown * np.maximum(rows[0, 7], least[:, 7]))
+        slips, wrong = np.hypot(*sums[:, :2].T) > place, np.abs(sums[:, 2]) > turn
+        if seen:
+            still = slips & (np.hypot(*(sums[:, :2] + sums[:, 3:5]).T) < 0.2 * way)
+            self.standing = self.standing + float(np.hypot(*leg.step[:2])) if still.any() else 0.0
+        self.stands, self.slips = self.standing > STANDS, bool(slips.any())
+        if self.slips:
             leg = replace(leg, blind=leg.seconds)
-        wrong = np.abs(sums[:, 2]) > turn
         if wrong.any():
-            rate = float((np.abs(sums[wrong, 2]) / sums[wrong, 7]).max())
+            rate = float((np.abs(sums[wrong, 2]) / sums[wrong, 8]).max())
             leg = replace(leg, rate_sigma=max(leg.rate_sigma, WIDER * rate))
         return leg
 

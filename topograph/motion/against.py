@@ -40,6 +40,7 @@ class Against:
         self.scale = 1.0
         self._variance = SCALE_SIGMA**2
         self._blocks: deque[tuple[float, float, float]] = deque(maxlen=BLOCKS)
+        self._lengths: deque[float] = deque(maxlen=BLOCKS)  # of the stretches, s
         self._open = np.zeros(
             6
         )  # gyro, wheels (rad), seconds, way of the wheels in the frame of the stretch's begin (x, y), its length
@@ -55,8 +56,12 @@ class Against:
             way = np.array([c * step[0] - s * step[1], s * step[0] + c * step[1]])
             self._open += (gyro, wheels, seconds, way[0], way[1], float(np.hypot(*way)))
         else:
-            self._begin, self._open[:] = None, 0.0
+            self.forget()
         return self._doubt()
+
+    def forget(self) -> None:
+        """The stretch that runs teaches nothing: its wheels or its gyro are known to be wrong."""
+        self._begin, self._open[:] = None, 0.0
 
     def see(self, pose: Array) -> None:
         """The pose (3,) on the map at the end of the last leg: x, y (m) and heading (rad)."""
@@ -71,6 +76,7 @@ class Against:
             turn = (pose[2] - self._begin[2] + np.pi) % (2 * np.pi) - np.pi
             self._learn_scale(float(np.hypot(*(pose[:2] - self._begin[:2]))), float(np.hypot(*self._open[3:5])))
         self._blocks.append((float(self._open[0]), float(self._open[1]), turn))
+        self._lengths.append(float(self._open[2]))
         self._open[:] = 0.0
         self._begin = pose
         b = np.array(self._blocks)
@@ -103,6 +109,7 @@ class Against:
             if correlation > ALIKE and DEGREES[0] < slope < DEGREES[1] and not self.degrees:
                 self.degrees = True
                 self._blocks.clear()
+                self._lengths.clear()
                 return 0.0
-        off = float(np.sqrt(np.mean((gyro - wheels) ** 2))) / BLOCK_S
+        off = float(np.sqrt(np.mean((gyro - wheels) ** 2)) / np.mean(self._lengths))
         return off if off > WRONG_TURN else 0.0

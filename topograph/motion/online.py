@@ -15,6 +15,8 @@ from topograph.motion.against import Against
 from topograph.motion.inertial import GRAVITY
 from topograph.motion.reckon import _filter, _quaternion_of
 
+AHEAD_NS, SET_AHEAD = 2_000_000_000, 3
+"""A message that is further ahead of its stream is none, unless more follow: then there was a gap, or the clock was set."""
 SET_BACK = 20
 """So many messages in a row that are older than the last one used: their clock was set back."""
 JUMP = (15.0, 0.5)
@@ -119,12 +121,15 @@ class Reckoner:
         self._at_ns: int | None = None
         self._against = Against()
         self._late: dict[str, int] = {}
+        self._newest: dict[str, int] = {}
 
     def add(self, message: Odometry | Imu) -> None:
         """One message. Older ones than were used already are passed over, and so is what is not finite or beyond what anything
         measures."""
         if isinstance(message, Imu):
-            sound = np.abs(message.gyro).max() < SOUND[0] and np.abs(message.accel).max() < SOUND[1]  # False for NaN
+            sound = (
+                np.abs(message.gyro).max() * self._rate_unit < SOUND[0] and np.abs(message.accel).max() < SOUND[1]
+            )  # False for NaN
             if sound and self._in_time("imu", message.stamp_ns, self._sample):
                 insort(self._imu, (message.stamp_ns, message.gyro, message.accel), key=_stamp)
         elif np.abs(message.odom_T_child).max() < FARTHEST and np.linalg.norm(message.odom_T_child[3:]) > 0.5:
@@ -133,10 +138,16 @@ class Reckoner:
                 insort(self._wheels, (message.stamp_ns, pose @ self.child_T_robot), key=_stamp)
 
     def _in_time(self, kind: str, stamp_ns: int, last: tuple[int, Array] | tuple[int, Array, Array] | None) -> bool:
-        """Whether a message is newer than the last one that was used; many older ones in a row are a clock that was set back."""
+        """Whether a message is newer than the last one that was used, and not far ahead of those that came; many such in a row are
+        a clock that was set."""
+        newest = self._newest.get(kind, stamp_ns)
         late = last is not None and stamp_ns <= last[0]
-        self._late[kind] = self._late.get(kind, 0) + 1 if late else 0
-        return not late or self._late[kind] > SET_BACK
+        odd = late or stamp_ns > newest + AHEAD_NS
+        self._late[kind] = self._late.get(kind, 0) + 1 if odd else 0
+        if odd and self._late[kind] <= (SET_BACK if late else SET_AHEAD):
+            return False
+        self._newest[kind] = stamp_ns if odd else max(newest, stamp_ns)
+        return True
 
     def advance(self, stamp_ns: int) -> Leg:
         """Motion since the last call, with all messages up to `stamp_ns`; nothing moves when the stamp does not rise."""
@@ -174,6 +185,18 @@ class Reckoner:
             step=step, up=up, distance=distance, turned=turned, seconds=seconds, blind=blind, gyro=gyro,
             rate_sigma=float(np.hypot(min(np.sqrt(self._drift_cov[1, 1]), USUAL_BIAS), doubt)), level=self._attitude is not None, **tilt,
         )  # fmt: skip
+
+    def restart(self, stamp_ns: int) -> None:
+        """All clocks were set back: motion begins anew at `stamp_ns`; what was learnt of the sensors stays."""
+        self._wheels, self._imu, self._resting, self._speeds, self._late = [], [], [], [], {}
+        self._last = self._heard = self._velocity = self._rest_since = self._sample = self._attitude = None
+        self._at_ns, self._held_ns, self._newest = stamp_ns, 0, {}
+        self._drift_cov[:] = np.diag([HALF_TURN**2, self._drift_cov[1, 1]])
+        self._against.forget()
+
+    def forget_stretch(self) -> None:
+        """The last leg was contradicted by what was seen: wheels and gyro are not judged by it."""
+        self._against.forget()
 
     def hold(self, pose: Array, sigma: float) -> None:
         """The pose (3,) at the last stamp as a map has it, x, y (m) and heading (rad, ± `sigma`): what the gyro steadily drifts away

@@ -17,6 +17,7 @@ from topograph.trunks.config import TrunksConfig
 from topograph.trunks.features import FEATURES, describe
 from topograph.trunks.fit import OUT_SIZE, covariances, fit_chains, gather, members, merge_stems, suppress, vertical
 from topograph.trunks.ground import fit_ground
+from topograph.trunks.nothing import none_at
 from topograph.trunks.organise import angular_step, once, organise, rings_of
 from topograph.trunks.passage import passage, ring_image
 from topograph.trunks.runs import FIRST, LAST, RUN_SIZE, find_runs, heights, link
@@ -166,12 +167,6 @@ class Detector:
             free=c.free,
             eye=self.base_T_lidar[:3, 3],
         )  # fmt: skip
-
-
-def none_at(stamp_ns: int) -> Trunks:
-    """No trunks."""
-    z = np.zeros(0)
-    return Trunks(stamp_ns, "base_link", np.zeros((0, 3)), np.zeros((0, 3)), z, np.zeros((0, 3, 3)), z, z)
 
 
 @lru_cache(maxsize=1)

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzz import copy
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
-from rosbags import rosbag1, rosbag2
+from rosbags import rosbag1
 from rosbags.highlevel import AnyReader
 
 from topograph.bags import BagsConfig, Recording
@@ -28,9 +28,7 @@ FORMATS = ("none.bag", "lz4.bag", "bz2.bag", "none.mcap", "lz4.mcap", "zstd.mcap
 
 def write(folder: Path, name: str) -> Path:
     """A recording of fixes (small) and clouds of text (large: overflow pages, several chunks), in one of the formats."""
-    compression, suffix = name.split(".")
-    out = folder / name
-    source = folder / ("source.bag" if suffix == "bag" else "source")
+    source = folder / ("source.bag" if name.endswith(".bag") else "source")
     if not source.exists():
         rng = np.random.default_rng(1)
         with BagWriter(source) as w:
@@ -44,38 +42,7 @@ def write(folder: Path, name: str) -> Path:
                     for n in "xyz":
                         cloud[n] = rng.normal(0, 1, 3000)
                     w.points("/points", t, t, "velodyne", cloud)
-    with AnyReader([source]) as r:
-        if suffix == "bag":
-            writer = rosbag1.Writer(out)
-            writer.chunk_threshold = 1 << 16
-            if compression != "none":
-                writer.set_compression(rosbag1.Writer.CompressionFormat[compression.upper()])
-            with writer:
-                to = {c.id: writer.add_connection(c.topic, c.msgtype, typestore=r.typestore) for c in r.connections}
-                for c, t, raw in r.messages():
-                    writer.write(to[c.id], t, raw)
-            return out
-        if suffix == "mcap":
-            kind = CompressionType[compression.upper()]
-            with out.open("wb") as f:
-                mcap = McapWriter(f, chunk_size=1 << 16, compression=kind)
-                mcap.start("ros2")
-                ids = {}
-                for c in r.connections:
-                    text, _ = r.typestore.generate_msgdef(c.msgtype, ros_version=2)
-                    schema = mcap.register_schema(c.msgtype, "ros2msg", text.encode())
-                    ids[c.id] = mcap.register_channel(c.topic, "cdr", schema)
-                for c, t, raw in r.messages():
-                    mcap.add_message(ids[c.id], t, bytes(raw), t)
-                mcap.finish()
-            return out
-        writer2 = rosbag2.Writer(folder / compression, version=9, storage_plugin=rosbag2.StoragePlugin.SQLITE3)
-        with writer2:
-            to2 = {c.id: writer2.add_connection(c.topic, c.msgtype, typestore=r.typestore) for c in r.connections}
-            for c, t, raw in r.messages():
-                writer2.write(to2[c.id], t, raw)
-    (folder / compression / f"{compression}.{suffix}").rename(out)
-    return out
+    return copy(source, folder, name)
 
 
 @pytest.fixture(scope="module")

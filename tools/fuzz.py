@@ -23,6 +23,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import fields, replace
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType
@@ -38,7 +39,7 @@ from topograph.pipeline import audited, inspect_bags, read_run, solve_run, topo_
 from topograph.simulate import DriveConfig, SensorConfig, record
 from topograph.topomap import TopoMap
 
-FORMATS = ("plain.bag", "lz4.bag", "plain.mcap", "zstd.mcap", "rows.db3")
+FORMATS = ("none.bag", "lz4.bag", "none.mcap", "zstd.mcap", "rows.db3")
 LONGEST_S, LARGEST_MB = 60.0, 1500.0
 
 
@@ -54,42 +55,37 @@ def bases(folder: Path, seed: int) -> dict[str, Path]:
 
 
 def copy(run: Path, folder: Path, name: str) -> Path:
+    """A recording anew as COMPRESSION.bag, COMPRESSION.mcap (in chunks of 64 KB) or NAME.db3; ROS 1 for .bag, ROS 2 for the others."""
     compression, suffix = name.split(".")
     out = folder / name
     with AnyReader([run]) as r:
-        if suffix == "bag":
-            w1 = rosbag1.Writer(out)
-            w1.chunk_threshold = 1 << 16
-            if compression == "lz4":
-                w1.set_compression(rosbag1.Writer.CompressionFormat.LZ4)
-            with w1:
-                to = {c.id: w1.add_connection(c.topic, c.msgtype, typestore=r.typestore) for c in r.connections}
-                for c, t, raw in r.messages():
-                    w1.write(to[c.id], t, raw)
-            return out
         if suffix == "mcap":
             with out.open("wb") as f:
-                mcap = McapWriter(
-                    f,
-                    chunk_size=1 << 16,
-                    compression=CompressionType.ZSTD if compression == "zstd" else CompressionType.NONE,
-                )
+                mcap = McapWriter(f, chunk_size=1 << 16, compression=CompressionType[compression.upper()])
                 mcap.start("ros2")
                 ids = {}
                 for c in r.connections:
                     text, _ = r.typestore.generate_msgdef(c.msgtype, ros_version=2)
-                    ids[c.id] = mcap.register_channel(
-                        c.topic, "cdr", mcap.register_schema(c.msgtype, "ros2msg", text.encode())
-                    )
+                    schema = mcap.register_schema(c.msgtype, "ros2msg", text.encode())
+                    ids[c.id] = mcap.register_channel(c.topic, "cdr", schema)
                 for c, t, raw in r.messages():
                     mcap.add_message(ids[c.id], t, bytes(raw), t)
                 mcap.finish()
             return out
-        with rosbag2.Writer(folder / compression, version=9, storage_plugin=rosbag2.StoragePlugin.SQLITE3) as w2:
-            to2 = {c.id: w2.add_connection(c.topic, c.msgtype, typestore=r.typestore) for c in r.connections}
+        writer: Any
+        if suffix == "bag":
+            writer = rosbag1.Writer(out)
+            writer.chunk_threshold = 1 << 16
+            if compression != "none":
+                writer.set_compression(rosbag1.Writer.CompressionFormat[compression.upper()])
+        else:
+            writer = rosbag2.Writer(folder / compression, version=9, storage_plugin=rosbag2.StoragePlugin.SQLITE3)
+        with writer:
+            to = {c.id: writer.add_connection(c.topic, c.msgtype, typestore=r.typestore) for c in r.connections}
             for c, t, raw in r.messages():
-                w2.write(to2[c.id], t, raw)
-    (folder / compression / f"{compression}.{suffix}").rename(out)
+                writer.write(to[c.id], t, raw)
+    if suffix == "db3":
+        (folder / compression / f"{compression}.db3").rename(out)
     return out
 
 
@@ -187,6 +183,23 @@ def a_map(folder: Path, seed: int) -> TopoMap:
     return topo_map(solve_run(read, Config()), Config(), {})
 
 
+def _aftermath(path: Path, old: TopoMap, out: Counter[str]) -> None:
+    """What is found after a save that did not end: a whole map, and nothing beside it once another was saved."""
+    try:
+        whole = same(replace(store.load(path), meta={}), replace(old, meta={}))
+        out["a whole map" if whole else "TORN"] += 1
+    except TopographError as err:
+        out[f"LOST: {err}"] += 1
+    with store.locked(path):
+        store.save(old, path)
+    stray = sorted(
+        p.name
+        for p in path.parent.iterdir()
+        if "map" in p.name and p.name != "map.gpkg" and not p.name.endswith(".lock")
+    )
+    out["STRAY " + " ".join(stray) if stray else "nothing stray"] += 1
+
+
 def kills(number: int, seed: int, folder: Path) -> Counter[str]:
     """Children save an old and a new map by turns until they are killed."""
     rng = random.Random(seed)
@@ -206,20 +219,7 @@ def kills(number: int, seed: int, folder: Path) -> Counter[str]:
         time.sleep(rng.uniform(0.0, 0.12))
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
-        try:
-            found = store.load(path)
-            ok = same(replace(found, meta={}), replace(old, meta={}))
-            out["old or new map" if ok else "TORN"] += 1
-        except TopographError as err:
-            out[f"LOST: {err}"] += 1
-        with store.locked(path):
-            store.save(old, path)
-        stray = sorted(
-            p.name
-            for p in folder.iterdir()
-            if p.name.startswith(("map", ".map")) and p.name != "map.gpkg" and not p.name.endswith(".lock")
-        )
-        out["STRAY " + " ".join(stray) if stray else "nothing stray"] += 1
+        _aftermath(path, old, out)
     return out
 
 
@@ -247,22 +247,10 @@ def full(number: int, seed: int, folder: Path) -> Counter[str]:
             except BaseException:  # noqa: BLE001  # what is looked for
                 traceback.print_exc()
                 os._exit(4)
-        rng.random()
         _, status = os.waitpid(child, 0)
         code = os.waitstatus_to_exitcode(status)
         out[{0: "WRITTEN beyond the limit", 3: "refused in one line"}.get(code, f"TRACEBACK (exit {code})")] += 1
-        try:
-            out["old map" if same(store.load(path), old) else "TORN"] += 1
-        except TopographError as err:
-            out[f"LOST: {err}"] += 1
-        with store.locked(path):
-            store.save(old, path)
-        stray = sorted(
-            p.name
-            for p in folder.iterdir()
-            if p.name.startswith(("map", ".map")) and p.name != "map.gpkg" and not p.name.endswith(".lock")
-        )
-        out["STRAY " + " ".join(stray) if stray else "nothing stray"] += 1
+        _aftermath(path, old, out)
     return out
 
 

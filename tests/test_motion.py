@@ -425,7 +425,7 @@ def test_trunks_watch_wheels_and_gyro(seed: int) -> None:
                 step=np.array([0.1 * wheels, 0.0, 0.02 * gyro]), distance=0.1 * wheels, turned=0.02 * gyro, seconds=0.1
             )
             out = watch.check(seen[rng.random(len(seen)) < 0.8], leg)
-            blind += out.blind > 0
+            blind += out.slip > 0
             doubted += out.rate_sigma > 0
         return blind / 100, doubted / 100
 

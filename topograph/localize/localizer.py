@@ -252,6 +252,7 @@ def move_of(leg: Leg, config: LocalizeConfig) -> Move:
     across = c.across * leg.distance + (c.step if leg.distance > 1e-4 else 1e-4)
     if leg.blind > 0:  # a robot drives at a walking pace
         along = across = float(np.hypot(along, 0.5 * leg.blind + 0.05))
+    along, across = float(np.hypot(along, leg.slip)), float(np.hypot(across, leg.slip))
     if leg.gyro:
         yaw = np.hypot(c.yaw_gyro * leg.turned, c.yaw_rate * np.sqrt(max(leg.seconds, 0.0)))
         yaw = np.hypot(yaw, leg.rate_sigma * leg.seconds)

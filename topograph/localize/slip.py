@@ -25,16 +25,18 @@ SPREAD = 0.05
 """Least deviation of a trunk between two scans, m."""
 STANDS = 1.2
 """Way of the wheels, m, on which trunks that do not move are put down to spinning wheels, and not to a sensor that died."""
+LONGEST_S = 1.5
+"""Over longer, what odometry drifts adds up as well."""
 LEGS = (3, 15)
 FRESH = 0.3
 """Over so many legs it is judged: what is seen of the same trunks adds up, and their noise does not, but for such a share of the
 trunks that are new in each scan."""
 WIDER = 1.5
-"""A rate that is wrong is doubted by so much of what it is off by."""
+"""Steps and rates that are wrong are doubted by so much of what they are off by."""
 
 
 class SlipWatch:
-    """Held before a localizer: where the trunks contradict the wheels, legs are called blind, and turns are doubted (see `Leg`).
+    """Held before a localizer: where the trunks contradict the wheels, steps are made wide, and turns are doubted (see `Leg`).
 
     Attributes:
         standing: m that the wheels went on while the trunks did not move.
@@ -55,8 +57,9 @@ class SlipWatch:
         flat = flat[np.isfinite(flat).all(axis=1), :2]
         flat = flat[np.hypot(*flat.T) < REACH] if len(flat) else flat
         last, self._last = self._last, flat
-        if leg.seconds <= 0 or last is None:
-            self._rows = []
+        self.slips = self.stands = False
+        if leg.seconds <= 0 or leg.blind > 0 or last is None:
+            self._rows, self.standing = [], 0.0
             return leg
         found = _residual(last, flat, leg)
         if found is None:
@@ -67,12 +70,13 @@ class SlipWatch:
             self._missed = 0
             told = np.array([*leg.step[:2], abs(leg.step[2]), *found[1], leg.seconds])
             self._rows = [*self._rows, np.concatenate([found[0], told])][-LEGS[1] :]
-        self.slips = self.stands = False
         return self._judged(leg, found is not None) if len(self._rows) >= LEGS[0] else leg
 
     def _judged(self, leg: Leg, seen: bool) -> Leg:
         # Suffixes of the last legs, from the third on.
         rows = np.array(self._rows)[::-1]
+        recent = int(np.searchsorted(np.cumsum(rows[:, 8]), LONGEST_S)) + 1
+        rows = rows[: max(recent, LEGS[0])]
         sums, least = np.cumsum(rows, axis=0)[LEGS[0] - 1 :], rows[LEGS[0] - 1 :]
         grown = SIGMAS * np.sqrt(1.0 + FRESH * np.arange(LEGS[0], len(rows) + 1))
         way = np.hypot(*sums[:, 3:5].T)
@@ -84,7 +88,8 @@ class SlipWatch:
             self.standing = self.standing + float(np.hypot(*leg.step[:2])) if still.any() else 0.0
         self.stands, self.slips = self.standing > STANDS, bool(slips.any())
         if self.slips:
-            leg = replace(leg, blind=leg.seconds)
+            legs = np.arange(LEGS[0], len(rows) + 1)
+            leg = replace(leg, slip=WIDER * float((np.hypot(*sums[:, :2].T) / legs)[slips].max()))
         if wrong.any():
             rate = float((np.abs(sums[wrong, 2]) / sums[wrong, 8]).max())
             leg = replace(leg, rate_sigma=max(leg.rate_sigma, WIDER * rate))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import insort
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,8 @@ from topograph.motion.against import Against
 from topograph.motion.inertial import GRAVITY
 from topograph.motion.reckon import _filter, _quaternion_of
 
-AHEAD_NS, SET_AHEAD = 2_000_000_000, 3
-"""A message that is further ahead of its stream is none, unless more follow: then there was a gap, or the clock was set."""
+AHEAD_NS = 2_000_000_000
+"""A message that is further ahead of its stream waits for one that agrees: then there was a gap, or the clock was set."""
 SET_BACK = 20
 """So many messages in a row that are older than the last one used: their clock was set back."""
 JUMP = (15.0, 0.5)
@@ -52,6 +53,9 @@ MOVING_SIGMA = 0.06
 """The same from less than a second of a drive, rad: the suspension's own accelerations."""
 
 
+_M = TypeVar("_M", tuple[int, Array], tuple[int, Array, Array])
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Leg:
     """Motion of the base between two stamps.
@@ -61,6 +65,7 @@ class Leg:
         roll, pitch: of the base at the second stamp, rad; zero without an IMU; `tilt_sigma` their deviation.
         distance, turned: m, rad, as driven.
         seconds: between the stamps; `blind` of them that no wheels cover.
+        slip: deviation of the step that somebody else has seen of the wheels, m.
         rate_sigma: of the gyro's bias, rad/s: unlike noise it does not average out within the leg.
         gyro, level: the turn is the gyro's; roll and pitch are held to gravity.
     """
@@ -74,6 +79,7 @@ class Leg:
     turned: float
     seconds: float
     blind: float = 0.0
+    slip: float = 0.0
     rate_sigma: float = 0.0
     gyro: bool = True
     level: bool = True
@@ -121,6 +127,7 @@ class Reckoner:
         self._at_ns: int | None = None
         self._against = Against()
         self._late: dict[str, int] = {}
+        self._ahead: dict[str, Any] = {}
         self._newest: dict[str, int] = {}
 
     def add(self, message: Odometry | Imu) -> None:
@@ -130,24 +137,37 @@ class Reckoner:
             sound = (
                 np.abs(message.gyro).max() * self._rate_unit < SOUND[0] and np.abs(message.accel).max() < SOUND[1]
             )  # False for NaN
-            if sound and self._in_time("imu", message.stamp_ns, self._sample):
-                insort(self._imu, (message.stamp_ns, message.gyro, message.accel), key=_stamp)
+            if sound:
+                for sample in self._in_time("imu", (message.stamp_ns, message.gyro, message.accel), self._sample):
+                    insort(self._imu, sample, key=_stamp)
         elif np.abs(message.odom_T_child).max() < FARTHEST and np.linalg.norm(message.odom_T_child[3:]) > 0.5:
             pose = from_quaternion(message.odom_T_child[:3], message.odom_T_child[3:])
-            if self._in_time("wheels", message.stamp_ns, self._heard):
-                insort(self._wheels, (message.stamp_ns, pose @ self.child_T_robot), key=_stamp)
+            for heard in self._in_time("wheels", (message.stamp_ns, pose @ self.child_T_robot), self._heard):
+                insort(self._wheels, heard, key=_stamp)
 
-    def _in_time(self, kind: str, stamp_ns: int, last: tuple[int, Array] | tuple[int, Array, Array] | None) -> bool:
-        """Whether a message is newer than the last one that was used, and not far ahead of those that came; many such in a row are
-        a clock that was set."""
+    def _in_time(self, kind: str, message: _M, last: tuple[int, Any] | tuple[int, Any, Any] | None) -> list[_M]:
+        """The message, if it is newer than the last one that was used and not far ahead of those that came; many older ones in a row
+        are a clock that was set back. One that waited comes with the next that agrees."""
+        stamp_ns = message[0]
         newest = self._newest.get(kind, stamp_ns)
-        late = last is not None and stamp_ns <= last[0]
-        odd = late or stamp_ns > newest + AHEAD_NS
-        self._late[kind] = self._late.get(kind, 0) + 1 if odd else 0
-        if odd and self._late[kind] <= (SET_BACK if late else SET_AHEAD):
-            return False
-        self._newest[kind] = stamp_ns if odd else max(newest, stamp_ns)
-        return True
+        if last is not None and stamp_ns <= last[0]:
+            self._late[kind] = self._late.get(kind, 0) + 1
+            if self._late[kind] <= SET_BACK:
+                return []
+            self._newest[kind] = stamp_ns
+            return [message]
+        self._late[kind] = 0
+        if stamp_ns <= newest + AHEAD_NS:
+            self._newest[kind] = max(newest, stamp_ns)
+            self._ahead.pop(kind, None)
+            return [message]
+        waited = self._ahead.get(kind)
+        self._ahead[kind] = message
+        if waited is None or not 0 < stamp_ns - waited[0] < AHEAD_NS:
+            return []
+        self._newest[kind] = stamp_ns
+        del self._ahead[kind]
+        return [waited, message]
 
     def advance(self, stamp_ns: int) -> Leg:
         """Motion since the last call, with all messages up to `stamp_ns`; nothing moves when the stamp does not rise."""
@@ -188,7 +208,7 @@ class Reckoner:
 
     def restart(self, stamp_ns: int) -> None:
         """All clocks were set back: motion begins anew at `stamp_ns`; what was learnt of the sensors stays."""
-        self._wheels, self._imu, self._resting, self._speeds, self._late = [], [], [], [], {}
+        self._wheels, self._imu, self._resting, self._speeds, self._late, self._ahead = [], [], [], [], {}, {}
         self._last = self._heard = self._velocity = self._rest_since = self._sample = self._attitude = None
         self._at_ns, self._held_ns, self._newest = stamp_ns, 0, {}
         self._drift_cov[:] = np.diag([HALF_TURN**2, self._drift_cov[1, 1]])

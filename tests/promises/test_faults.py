@@ -12,7 +12,7 @@ CHOSEN = [
     "each message twice", "arrival shuffled by 0.9 s", "odometry stops half way", "imu frame empty", "fix frame unknown",
     "imu_link upside down", "gnss x + 1 m", "gnss_baseline yaw 90", "trunks' mount yaw 180", "trunks' mount yaw 5",
     "trunks' mount y + 0.3 m", "trunks' mount pitch 10", "fix altitude NaN", "fix lat and lon swapped", "fix 40 % outliers of 5 m",
-    "fix jumps 0.5 m half way", "fix jumps 10.0 m half way", "fix frozen", "two fixes", "imu gyro dead", "imu gyro z flipped",
+    "fix jumps 0.5 m half way", "fix jumps 0.5 m until half way", "fix jumps 10.0 m half way", "fix frozen", "two fixes", "imu gyro dead", "imu gyro z flipped",
     "imu one rate of 1000", "wheels x 0.0 for 3 s", "wheels x 3.0 for 3 s", "wheels x 1.3", "odometry pose zero, twist good",
     "trunks mirrored", "a person beside the robot",
 ]  # fmt: skip

@@ -1,6 +1,18 @@
 """Do the streams agree with each other and with the solve? Sound, doubtful because, refused because."""
 
-from topograph.audit.checks import REFUSING, fixes, headings, lean, offsets, standing, trunks, twice
+from topograph.audit.checks import REFUSING, fixes, headings, jumps, lean, offsets, standing, trunks, twice
 from topograph.audit.verdict import Finding, Verdict
 
-__all__ = ["REFUSING", "Finding", "Verdict", "fixes", "headings", "lean", "offsets", "standing", "trunks", "twice"]
+__all__ = [
+    "REFUSING",
+    "Finding",
+    "Verdict",
+    "fixes",
+    "headings",
+    "jumps",
+    "lean",
+    "offsets",
+    "standing",
+    "trunks",
+    "twice",
+]

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from topograph.audit.verdict import Finding
 from topograph.estimate import Estimate, Problem
 from topograph.estimate.initial import heading_misfit
-from topograph.geometry import Array, inverse, transform
+from topograph.geometry import Array, inverse, transform, yaw_of
 from topograph.motion import Motion, Streams
 
 SURE = 25.0
@@ -41,6 +41,11 @@ TILT = 0.07
 """Mean lean of all trunks in the robot's own frame, rad (clean: up to 0.03, where axes are recorded; 0.01 in LiDAR runs)."""
 DRIFT = (0.05, 6.0)
 """Fixes may drift so far while the wheels stand, m and standard deviations (clean: 0.01)."""
+JUMP, JUMP_FIXES, JUMP_S = (0.2, 8.0), 8, 6.0
+"""A step of the fixes against dead reckoning, m and stated deviations, between the medians of so many fixes before and after it, all within
+so many seconds (clean: up to 0.08 m)."""
+JUMP_WIDE = 0.3
+"""Of the step: how far the fixes of one side may lie apart."""
 REFUSING = ("moving",)
 """Findings that refuse a map."""
 ALIKE_S = 6.0
@@ -115,6 +120,44 @@ def fixes(problem: Problem, estimate: Estimate) -> Iterator[Finding]:
             name="fixes not believed", value=share, bound=UNBELIEVED, unit="",
             sentence=f"for {100 * share:.0f} % of the run fixes lie {float(np.median(np.array(off)[far])):.2f} m from where the other fixes, wheels and trunks "
             f"put them (from {np.array(begin)[far][0]:.0f} to {np.array(begin)[far][-1] + STRETCH_S:.0f} s): either part may be the right one; check the receiver's base",
+        )  # fmt: skip
+
+
+def jumps(problem: Problem, estimate: Estimate, streams: Streams, lever: Array) -> Iterator[Finding]:
+    """Do the fixes step aside and stay there, while wheels and gyro go on? `lever` (3,) is the antenna's place in the robot's frame.
+
+    Over a few seconds dead reckoning is good to centimetres; a solve may bend a whole run to take in half a metre.
+    """
+    n, motion = len(streams.fix_ns), problem.motion
+    if n < 4 * JUMP_FIXES or len(problem.stamps_ns) < 2:
+        return
+    at = motion.at(streams.fix_ns)
+    nearest = np.clip(np.searchsorted(problem.stamps_ns, streams.fix_ns), 0, len(problem.stamps_ns) - 1)
+    yaw = yaw_of(estimate.map_T_robot[nearest]) - yaw_of(motion.at(problem.stamps_ns[nearest]))
+    told = transform(at, np.broadcast_to(lever, (n, 3)))[:, :2]
+    c, s = np.cos(yaw), np.sin(yaw)
+    fix, sigma = streams.fixes_enu()[:, :2], streams.fix_sigma()
+    worst, when, most = 0.0, 0.0, 1.0
+    for i in range(JUMP_FIXES, n - JUMP_FIXES):
+        mine = slice(i - JUMP_FIXES, i + JUMP_FIXES)
+        if streams.fix_ns[i + JUMP_FIXES - 1] - streams.fix_ns[i - JUMP_FIXES] > JUMP_S * 1e9:
+            continue
+        way = told[mine] - told[i]
+        turned = np.column_stack([c[i] * way[:, 0] - s[i] * way[:, 1], s[i] * way[:, 0] + c[i] * way[:, 1]])
+        left = fix[mine] - turned
+        sides = [np.median(part, axis=0) for part in (left[:JUMP_FIXES], left[JUMP_FIXES:])]
+        step = float(np.linalg.norm(sides[1] - sides[0]))
+        wide = np.hypot(*(left - np.repeat(sides, JUMP_FIXES, axis=0)).T).reshape(2, -1)
+        if np.median(wide, axis=1).max() > JUMP_WIDE * step:
+            continue  # scattered outliers, not two places
+        bound = max(JUMP[0], JUMP[1] * float(np.median(sigma[mine])))
+        if step > bound and step / bound > worst / most:
+            worst, when, most = step, (streams.fix_ns[i] - motion.stamps_ns[0]) * 1e-9, bound
+    if worst > 0:
+        yield Finding(
+            name="fixes jump", value=worst, bound=most, unit="m",
+            sentence=f"at {when:.0f} s the fixes step aside by {worst:.2f} m and stay there, while wheels and gyro go on: either side may be the "
+            "right one; check the receiver's base and ambiguities",
         )  # fmt: skip
 
 

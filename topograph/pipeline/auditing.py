@@ -6,6 +6,7 @@ import numpy as np
 
 from topograph import audit
 from topograph.audit import Finding, Verdict
+from topograph.geometry import Array
 from topograph.motion import mount_turn
 from topograph.pipeline.mapping import Solved
 from topograph.topomap.map import TREE
@@ -17,6 +18,7 @@ def audited(solved: Solved) -> Verdict:
     found = [
         *audit.offsets(p, e),
         *audit.fixes(p, e),
+        *audit.jumps(p, e, solved.streams, _lever(solved)),
         *audit.standing(solved.streams, solved.motion),
         *audit.headings(p, e),
         *audit.trunks(p, e, solved.moving, solved.existence.kind == TREE),
@@ -27,6 +29,12 @@ def audited(solved: Solved) -> Verdict:
 
 TURNED = np.radians(45.0)
 """An IMU whose accelerations fit a mounting turned by more than this is mounted otherwise than was said."""
+
+
+def _lever(solved: Solved) -> Array:
+    """The antenna's place (3,) in the robot's frame, m; the origin where nobody says."""
+    mount = solved.run.mounts.get("fix")
+    return np.zeros(3) if mount is None else mount[:3, 3]
 
 
 def _mounts(solved: Solved) -> list[Finding]:

@@ -189,7 +189,11 @@ def _seven(T: np.ndarray) -> np.ndarray:
 _own()
 for _name, _fault in FAULTS.items():
     if _name == "clean" or (
-        any(w in _name for w in KINDS) and "mount" not in _name and "frame" not in _name and "imu_link" not in _name
+        "host clock" not in _name
+        and any(w in _name for w in KINDS)
+        and "mount" not in _name
+        and "frame" not in _name
+        and "imu_link" not in _name
     ):
         LIVE.setdefault(_name, _fault)
 

@@ -41,9 +41,9 @@ TILT = 0.07
 """Mean lean of all trunks in the robot's own frame, rad (clean: up to 0.03, where axes are recorded; 0.01 in LiDAR runs)."""
 DRIFT = (0.05, 6.0)
 """Fixes may drift so far while the wheels stand, m and standard deviations (clean: 0.01)."""
-JUMP, JUMP_FIXES, JUMP_S = (0.2, 8.0), 8, 6.0
+JUMP, JUMP_FIXES, JUMP_S = (0.33, 8.0), 8, 6.0
 """A step of the fixes against dead reckoning, m and stated deviations, between the medians of so many fixes before and after it, all within
-so many seconds (clean: up to 0.08 m)."""
+so many seconds (clean: up to 0.21 m, in tight turns)."""
 JUMP_WIDE = 0.3
 """Of the step: how far the fixes of one side may lie apart."""
 REFUSING = ("moving",)

@@ -19,6 +19,7 @@ import tempfile
 import time
 import traceback
 from collections import Counter
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import fields, replace
 from multiprocessing import get_context
@@ -110,29 +111,18 @@ def mutate(data: bytes, rng: np.random.Generator, mode: int) -> bytes:
     return bytes(b)
 
 
-def one_bag(job: tuple[Path, int, int, Path]) -> tuple[str, int, str, float, float]:
-    source, k, seed, folder = job
-    rng = np.random.default_rng([seed, k, sum(map(ord, source.name))])
+Result = tuple[str, int, str, float, float]
+"""File, number, what came of it, s, MB."""
+
+
+def one(source: Path, k: int, rng: np.random.Generator, folder: Path, read: Callable[[Path], str]) -> Result:
+    """A mutated copy of a file, and what `read` says of it."""
     began = time.monotonic()
     with tempfile.TemporaryDirectory(dir=folder) as at:
         path = Path(at) / source.name
         path.write_bytes(mutate(source.read_bytes(), rng, k % 6))
         try:
-            inspect_bags([path], Config())
-            with Recording([path]) as r:
-                announced = sum(r.counts[t] for t in r.chosen.values())
-            run = read_run([path], Config())
-            s = run.streams
-            used = len(s.odometry_ns) + len(s.imu_ns) + len(s.fix_ns) + len(s.heading_ns) + len(run.trunks)
-            missing = announced - used - sum(n for why, n in run.skipped.items() if not why.startswith("tf"))
-            more = missing < 0 and any(
-                "sequence" in n or "announced" in n for n in run.notes
-            )  # than the damaged index announced
-            said = "read" if missing == 0 or more else f"LOST {missing}"
-            if k % 10 == 0:
-                solved = solve_run(run, Config())
-                topo_map(solved, Config(), {})
-                audited(solved)
+            said = read(path)
         except TopographError:
             said = "refused"
         except Exception as err:  # noqa: BLE001  # what is looked for
@@ -142,23 +132,35 @@ def one_bag(job: tuple[Path, int, int, Path]) -> tuple[str, int, str, float, flo
     return source.name, k, said, time.monotonic() - began, mb
 
 
-def one_map(job: tuple[Path, int, int, Path]) -> tuple[str, int, str, float, float]:
+def one_bag(job: tuple[Path, int, int, Path]) -> Result:
     source, k, seed, folder = job
-    rng = np.random.default_rng([seed, k])
-    began = time.monotonic()
+
+    def read(path: Path) -> str:
+        inspect_bags([path], Config())
+        with Recording([path]) as r:
+            announced = sum(r.counts[t] for t in r.chosen.values())
+        run = read_run([path], Config())
+        s = run.streams
+        used = len(s.odometry_ns) + len(s.imu_ns) + len(s.fix_ns) + len(s.heading_ns) + len(run.trunks)
+        missing = announced - used - sum(n for why, n in run.skipped.items() if not why.startswith("tf"))
+        more = missing < 0 and any("sequence" in n or "announced" in n for n in run.notes)  # than the index announced
+        if k % 10 == 0:
+            solved = solve_run(run, Config())
+            topo_map(solved, Config(), {})
+            audited(solved)
+        return "read" if missing == 0 or more else f"LOST {missing}"
+
+    return one(source, k, np.random.default_rng([seed, k, sum(map(ord, source.name))]), folder, read)
+
+
+def one_map(job: tuple[Path, int, int, Path]) -> Result:
+    source, k, seed, folder = job
     whole = store.load(source)
-    with tempfile.TemporaryDirectory(dir=folder) as at:
-        path = Path(at) / "map.gpkg"
-        path.write_bytes(mutate(source.read_bytes(), rng, k % 6))
-        try:
-            said = "read" if same(store.load(path), whole) else "WRONG CLAIM: not what was written"
-        except TopographError:
-            said = "refused"
-        except Exception as err:  # noqa: BLE001  # what is looked for
-            where = traceback.extract_tb(err.__traceback__)[-1]
-            said = f"TRACEBACK {type(err).__name__}: {err} ({Path(where.filename).name}:{where.lineno})"
-    mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return "map", k, said, time.monotonic() - began, mb
+
+    def read(path: Path) -> str:
+        return "read" if same(store.load(path), whole) else "WRONG CLAIM: not what was written"
+
+    return one(source, k, np.random.default_rng([seed, k]), folder, read)
 
 
 def same(a: TopoMap, b: TopoMap) -> bool:
@@ -233,10 +235,10 @@ def full(number: int, seed: int, folder: Path) -> Counter[str]:
     size = path.stat().st_size
     out: Counter[str] = Counter()
     for _ in range(number):
+        limit = rng.randrange(int(0.95 * size))  # before the fork: the child's generator ends with it
         child = os.fork()
         if child == 0:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-            limit = rng.randrange(int(0.95 * size))
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
             try:
                 with store.locked(path):

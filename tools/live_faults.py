@@ -43,7 +43,6 @@ KINDS = (
     "dark",
     "stands",
     "all clocks",
-    "host clock",
 )
 """Words in the names of the faults of tools/faults.py that a live robot can meet."""
 LIVE: dict[str, Fault] = {}
@@ -189,11 +188,7 @@ def _seven(T: np.ndarray) -> np.ndarray:
 _own()
 for _name, _fault in FAULTS.items():
     if _name == "clean" or (
-        "host clock" not in _name
-        and any(w in _name for w in KINDS)
-        and "mount" not in _name
-        and "frame" not in _name
-        and "imu_link" not in _name
+        any(w in _name for w in KINDS) and "mount" not in _name and "frame" not in _name and "imu_link" not in _name
     ):
         LIVE.setdefault(_name, _fault)
 

@@ -234,9 +234,8 @@ class Recording:
         Of the clouds only each `every`-th is decoded; the others, and what cannot be decoded, are None.
         """
         wanted = {topic: kind for kind, topic in self.chosen.items()}
-        merged = heapq.merge(*(self._raw(i, set(wanted), None) for i in range(len(self._readers))), key=lambda m: m[1])
         seen: Counter[str] = Counter()
-        for i, log_ns, connection, raw in merged:
+        for i, log_ns, connection, raw in self._merged(set(wanted), None):
             kind = wanted[connection.topic]
             seen[kind] += 1
             if kind == "points" and seen[kind] % every:
@@ -255,10 +254,7 @@ class Recording:
     def _decoded(self, wanted: dict[str, str], window_ns: tuple[int, int] | None) -> Iterator[Message]:
         """Products in order of recording, stamps as they are; what the index announces and the file does not give is counted."""
         self.given = Counter()
-        merged = heapq.merge(
-            *(self._raw(i, set(wanted), window_ns) for i in range(len(self._readers))), key=lambda m: m[1]
-        )
-        for i, log_ns, connection, raw in merged:
+        for i, log_ns, connection, raw in self._merged(set(wanted), window_ns):
             within = self.count_within
             self._counting = within is None or within[0] <= log_ns < within[1]
             self.given[wanted[connection.topic]] += self._counting
@@ -280,6 +276,11 @@ class Recording:
         if self.counts[topic] > self.given[kind]:
             self.skipped[f"{kind}: {DAMAGED}"] += self.counts[topic] - self.given[kind]
         self.counts[topic] = max(self.counts[topic], self.given[kind])  # reading in sequence may find more
+
+    def _merged(self, names: set[str], window_ns: tuple[int, int] | None) -> Iterator[tuple[int, int, Connection, Any]]:
+        """(file, time of recording, connection, bytes) of the topics in order of recording."""
+        parts = (self._raw(i, names, window_ns) for i in range(len(self._readers)))
+        return heapq.merge(*parts, key=lambda m: m[1])
 
     def _raw(
         self, i: int, names: set[str], window_ns: tuple[int, int] | None

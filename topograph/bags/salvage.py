@@ -87,7 +87,7 @@ class Salvaged:
 
     @property
     def lost(self) -> str:
-        missing = getattr(self._blocks, "missing", 0)
+        missing = self._blocks.missing
         parts = [
             f"{self._broken} damaged blocks" if self._broken else "",
             f"{self._blocks.unread} bytes that are no whole record" if self._blocks.unread else "",

@@ -15,6 +15,7 @@ from topograph.geometry import Array, exp, from_quaternion, inverse, log
 from topograph.motion.against import Against
 from topograph.motion.inertial import GRAVITY
 from topograph.motion.reckon import _filter, _quaternion_of
+from topograph.motion.samples import RANGE
 
 AHEAD_NS = 2_000_000_000
 """A message that is further ahead of its stream waits for one that agrees: then there was a gap, or the clock was set."""
@@ -47,8 +48,6 @@ HEADING_WALK = 1e-3
 """How far gyro and map may part by noise alone, rad/√s."""
 LEVEL_SIGMA = 0.01
 """Roll and pitch as gravity holds them over time, rad."""
-SOUND = (35.0, 160.0)
-"""Full scale of MEMS sensors, rad/s and m/s²: what is beyond was not measured."""
 MOVING_SIGMA = 0.06
 """The same from less than a second of a drive, rad: the suspension's own accelerations."""
 
@@ -135,7 +134,7 @@ class Reckoner:
         measures."""
         if isinstance(message, Imu):
             sound = (
-                np.abs(message.gyro).max() * self._rate_unit < SOUND[0] and np.abs(message.accel).max() < SOUND[1]
+                np.abs(message.gyro).max() * self._rate_unit < RANGE[0] and np.abs(message.accel).max() < RANGE[1]
             )  # False for NaN
             if sound:
                 for sample in self._in_time("imu", (message.stamp_ns, message.gyro, message.accel), self._sample):

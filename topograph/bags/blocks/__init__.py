@@ -24,11 +24,15 @@ class Blocks(Protocol):
         channels: id -> channel, filled by `walk` and `load`.
         is2: messages are CDR (ROS 2); of mcap, once `walk` has passed.
         unread: bytes passed over, filled by `walk` and `load`.
+        missing: messages that those that were found tell of.
     """
 
     channels: dict[int, Channel]
     is2: bool
     unread: int
+
+    @property
+    def missing(self) -> int: ...
 
     def walk(self) -> Iterator[int]:
         """Where blocks begin, in the order of the file."""

@@ -10,6 +10,12 @@ Entry = tuple[int, int, bytes]
 """Channel, time of recording (ns), message."""
 
 
+def msgtype_of(name: str) -> str:
+    """A type's name in ROS 2's way: sensor_msgs/Imu is sensor_msgs/msg/Imu."""
+    package, _, typ = name.partition("/")
+    return name if "/msg/" in name else f"{package}/msg/{typ}"
+
+
 @dataclass(frozen=True, slots=True)
 class Channel:
     """A topic of a recording, its type (ROS 2's way of writing it) and the type's definition ("" where the file has none)."""

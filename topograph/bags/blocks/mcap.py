@@ -13,7 +13,7 @@ from mcap.records import Channel as ChannelRecord
 from mcap.records import Chunk, Schema
 from mcap.stream_reader import get_chunk_data_stream
 
-from topograph.bags.blocks.channel import Channel, Entry
+from topograph.bags.blocks.channel import Channel, Entry, msgtype_of
 
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _LAST = 3, 4, 5, 6, 15
 _MAGIC = b"\x89MCAP0\r\n"
@@ -25,6 +25,8 @@ _MESSAGE_HEAD = struct.Struct("<HIQQ")
 
 class McapBlocks:
     """Blocks are chunks, and messages outside of any."""
+
+    missing = 0
 
     def __init__(self, data: mmap.mmap) -> None:
         self.data = data
@@ -141,10 +143,10 @@ class McapBlocks:
             schema = self._schemas.get(channel.schema_id)
             if schema is not None:
                 self.is2 = channel.message_encoding != "ros1"
-                package, _, name = schema.name.partition("/")
-                typ = schema.name if "/msg/" in schema.name else f"{package}/msg/{name}"
                 text = schema.data.decode(errors="replace")
-                self.channels[channel.id] = Channel(channel.topic, typ, text, "idl" in schema.encoding)
+                self.channels[channel.id] = Channel(
+                    channel.topic, msgtype_of(schema.name), text, "idl" in schema.encoding
+                )
 
 
 def _message(raw: bytes) -> Entry:

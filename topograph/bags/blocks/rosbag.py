@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import lz4.frame
 
-from topograph.bags.blocks.channel import Channel, Entry
+from topograph.bags.blocks.channel import Channel, Entry, msgtype_of
 
 _MESSAGE, _HEADER, _INDEX, _CHUNK, _INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
 _LONGEST_HEADER = 1 << 16
@@ -24,6 +24,8 @@ Record = tuple[int, Fields, int, int]
 
 class RosbagBlocks:
     """Blocks are chunks, and messages outside of any: a chunk that was never closed says that its length is zero."""
+
+    missing = 0
 
     def __init__(self, data: mmap.mmap) -> None:
         self.data = data
@@ -81,9 +83,7 @@ class RosbagBlocks:
         if inside is None or b"conn" not in fields or b"type" not in inside:
             return
         topic = fields.get(b"topic", inside.get(b"topic", b"")).decode(errors="replace")
-        typ = inside[b"type"].decode(errors="replace")
-        package, _, name = typ.partition("/")
-        typ = typ if "/msg/" in typ else f"{package}/msg/{name}"
+        typ = msgtype_of(inside[b"type"].decode(errors="replace"))
         definition = inside.get(b"message_definition", b"").decode(errors="replace")
         self.channels.setdefault(_uint(fields[b"conn"]), Channel(topic, typ, definition))
 

@@ -63,7 +63,7 @@ BEHIND = 0.25
 """A return so far behind a run, between its ends, went through it, m."""
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def describe(p, r, runs, label, order, ends, fits, name, near, tangent, R, eye, above, beside, up, step):
     """Features (C, len(FEATURES)) of the trunks `fits` (C, OUT_SIZE)."""
     out = np.zeros((len(fits), _COUNT))
@@ -89,7 +89,7 @@ def describe(p, r, runs, label, order, ends, fits, name, near, tangent, R, eye, 
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _ladder(runs, mine, height, f):
     """How the runs follow each other upwards."""
     n = mine.shape[0]
@@ -111,7 +111,7 @@ def _ladder(runs, mine, height, f):
     f[_RING_GAP] = (runs[last, RING] - runs[first, RING] + 1.0) / n
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _surface(p, r, runs, label, mine, a, lx, ly, radius, f):
     """The face that is seen: how far from a cylinder, turned to a side, hollow or bulging, and how much shines through.
 
@@ -146,7 +146,7 @@ def _surface(p, r, runs, label, mine, a, lx, ly, radius, f):
     f[_HOLES] = holes / max(between, 1.0)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _around(above, beside, a, lx, ly, radius, f):
     """What stands beside it, and what hangs over it: a canopy is all around its trunk."""
     side = np.zeros(5)
@@ -159,7 +159,7 @@ def _around(above, beside, a, lx, ly, radius, f):
     f[_COVERED_NEAR], f[_COVERED] = side[3], side[4]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _beams(near, crossed, ground, radius, highest, f):
     """What the beams say that did not hit it: see `look_at`."""
     seen = np.zeros(SEEN_SIZE)

@@ -33,7 +33,7 @@ PUSH = 0.83
 """The mean return of a cylinder lies π/4 of its radius before the axis; mixed pixels at the edges take away the rest."""
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def vertical(runs, chain, most):
     """Which way trunks grow, as horizontal metres per metre of height (2,), in the base's frame: the median lean of what
     several rings cross, drawn to zero where there is little of it. On a slope the base is tilted and the trees are not.
@@ -68,7 +68,7 @@ def vertical(runs, chain, most):
     return np.array([gain * np.median(lean[0, :n]), gain * np.median(lean[1, :n])])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def members(chain):
     """Heads (C,) of the chains, their runs one after the other (K,) from below upwards, and the ends (C+1,)."""
     k = chain.shape[0]
@@ -94,7 +94,7 @@ def members(chain):
     return heads, order, ends
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def widths_of(runs, mine, step, far):
     """Measured diameter, its sigma and the spread of the rings' widths; rings far from the median do not count.
 
@@ -118,7 +118,7 @@ def widths_of(runs, mine, step, far):
     return mean, sigma, spread, w
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def axis_of(runs, mine, w, mean_width, radius, eye, step, far, up, row):
     """A line through the rings' centres, into `row`; lean is held by a prior about `up`. Returns the mean height."""
     n = mine.shape[0]
@@ -172,7 +172,7 @@ def axis_of(runs, mine, w, mean_width, radius, eye, step, far, up, row):
     row[LINE_RMS] = np.sqrt(line2 / n)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def fit_chains(runs, heads, order, ends, plane, grid, eye, step, up, reference, prior_d, prior_s, thinnest, widest):
     """Trunks (C, OUT_SIZE) and the number (C,) of the chain that each came from.
 
@@ -220,7 +220,7 @@ def fit_chains(runs, heads, order, ends, plane, grid, eye, step, up, reference, 
     return out[:m], name[:m]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def foot_distance(a, b):
     """Distance of two fits where their axes meet the ground, or at the height of their points where that is less, m."""
     ha, hb = a[ABOVE] / max(a[AXIS_Z], 0.3), b[ABOVE] / max(b[AXIS_Z], 0.3)
@@ -234,7 +234,7 @@ NOT_ONE = 0.12
 """A post and a tree are two things when their axes are further from each other than this, m."""
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def suppress(out, score, post, distance):
     """Group (C,) of each trunk: those that stand within `distance` m of a better one are its stems or its pieces; a thick
     trunk has its pieces within its radius. A `post` (C,) beside a tree is no piece of it: 1, -1 surely none, 0 who knows.
@@ -259,7 +259,7 @@ def suppress(out, score, post, distance):
     return group
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def merge_stems(fits, odds, group):
     """Rows (B,) of the best of each group, and their fits (B, OUT_SIZE): stems of one tree meet at its foot, and their
     mean, by points, stands for the tree. A stem is as thick as a third of the best, stands beside it, and its log-odds of
@@ -300,7 +300,7 @@ def merge_stems(fits, odds, group):
     return best[:b], out[:b]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def gather(wanted, n_groups, chain, runs, label, first, last):
     """Indices of the points of chains by group: `wanted` (K,) is the group of each chain or -1. Flat (M,), ends (G+1,)."""
     k = runs.shape[0]
@@ -324,7 +324,7 @@ def gather(wanted, n_groups, chain, runs, label, first, last):
     return out, ends
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def covariances(fits, scales):
     """Covariances (N, 3, 3) turned from the line of sight into the base's axes; `scales` (N, 2) on the radial and
     tangential deviations. What the lean adds at the height of the point is as uncertain in all directions.
@@ -345,7 +345,7 @@ def covariances(fits, scales):
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def heights_of(runs, mine):
     """Lowest and highest ring of a chain above the ground, m."""
     low, high = 1e9, -1e9

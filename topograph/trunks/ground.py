@@ -11,7 +11,11 @@ DIFFUSED = 12
 """Steps by which ground that was seen spreads into what was not: about as many metres."""
 
 
-@njit(cache=True, fastmath=FAST)
+NOTHING = np.float32(1e9)
+"""Height of a cell without ground, m."""
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def fit_ground(low):
     """Plane (3,) z = a + b x + c y, and residual heights (2·HALF, 2·HALF) on 1 m cells, all in the base's frame, m, from
     the lowest points of the cells (1e9: none).
@@ -66,7 +70,8 @@ def fit_ground(low):
         s[2, 2] += 1.0
         s[0, 0] += 1e-9
         plane[:] = np.linalg.solve(s, t)
-    valid = np.zeros((size, size), np.bool_)
+    # A rim of two cells of nothing: no neighbour is looked for outside.
+    high = np.full((size + 4, size + 4), NOTHING)
     for i in range(size):
         for j in range(size):
             if low[i, j] < 1e8:
@@ -74,8 +79,7 @@ def fit_ground(low):
                 e = low[i, j] - plane[0] - plane[1] * u - plane[2] * v
                 bound = 0.4 + 0.035 * np.sqrt(u * u + v * v)
                 if -bound - 0.3 < e < bound:
-                    grid[i, j] = e
-                    valid[i, j] = True
+                    high[i + 2, j + 2] = e
     # A cell much above a neighbour shows a thing; drop it.
     reach = np.empty((5, 5), np.float32)
     for di in range(5):
@@ -84,22 +88,18 @@ def fit_ground(low):
     for _ in range(2):
         for i in range(1, size - 1):
             for j in range(1, size - 1):
-                if not valid[i, j]:
+                if high[i + 2, j + 2] >= NOTHING:
                     continue
-                least = 1e9
-                for di in range(-2, 3):
-                    for dj in range(-2, 3):
-                        a, b = i + di, j + dj
-                        if 0 <= a < size and 0 <= b < size and valid[a, b]:
-                            g = grid[a, b] + reach[di + 2, dj + 2]
-                            if g < least:
-                                least = g
-                if grid[i, j] > least + 0.12:
-                    valid[i, j] = False
+                least = NOTHING
+                for di in range(5):
+                    for dj in range(5):
+                        least = min(least, high[i + di, j + dj] + reach[di, dj])
+                if high[i + 2, j + 2] > least + np.float32(0.12):
+                    high[i + 2, j + 2] = NOTHING
+    valid = high[2:-2, 2:-2] < NOTHING
     for i in range(size):
         for j in range(size):
-            if not valid[i, j]:
-                grid[i, j] = 0.0
+            grid[i, j] = high[i + 2, j + 2] if valid[i, j] else 0.0
     share, around = np.zeros((size, size), np.float32), np.zeros((size, size), np.float32)
     for i in range(1, size - 1):
         for j in range(1, size - 1):
@@ -115,7 +115,7 @@ def fit_ground(low):
     return plane, grid
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def ground_at(x, y, plane, grid):
     """Ground height at a position in the base's frame, bilinear between cell centres."""
     u, v = x + HALF - 0.5, y + HALF - 0.5

@@ -26,9 +26,9 @@ def rings_of(scan: Scan, flipped: bool = False) -> tuple[NDArray[np.int32], Arra
     ring = scan.ring
     if ring is None or not len(ring) or ring.min() < 0 or ring.max() >= MOST_RINGS:
         ring = _clusters(xyz)
-    full, total, n = _rise(xyz, ring, int(ring.max()) + 1, SAMPLE)
-    if (n[full > 0] < 3).any():
-        _, total, n = _rise(xyz, ring, len(n), 1)
+    total, n = _rise(xyz, ring, int(ring.max()) + 1, SAMPLE)
+    if (n < 3).any():  # rings of few returns, or of none
+        total, n = _rise(xyz, ring, len(n), 1)
     tangent = total / np.maximum(n, 1)
     tangent[n == 0] = np.inf  # nothing was returned: no place among the others
     order = np.argsort(-tangent if flipped else tangent, kind="stable")
@@ -47,19 +47,17 @@ SAMPLE = 7
 """Every so-manieth point tells a ring's elevation; no divisor of the usual numbers of lasers, which fire in turn."""
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _rise(xyz, ring, n, every):
-    """Points (n,) of each ring; sum of tangents of elevation and their number, (n,), of every so-manieth point."""
-    full, count, total = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n)
-    for i in range(len(ring)):
-        full[ring[i]] += 1
+    """Sum of tangents of elevation and their number, (n,), of every so-manieth point of each ring."""
+    count, total = np.zeros(n, np.int64), np.zeros(n)
     for i in range(0, len(ring), every):
         x, y = xyz[i, 0], xyz[i, 1]
         flat = np.sqrt(x * x + y * y)
         if flat > 0.0 and np.isfinite(flat) and np.isfinite(xyz[i, 2]):
             total[ring[i]] += xyz[i, 2] / flat
             count[ring[i]] += 1
-    return full, total, count
+    return total, count
 
 
 def _clusters(xyz: NDArray[np.float32]) -> NDArray[np.int32]:
@@ -95,7 +93,137 @@ def once(scan: Scan) -> Scan:
     return Scan(scan.stamp_ns, scan.frame, scan.xyz[:half], ring, offset, intensity)
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _by_ring(xyz, ring, offset, n_rings, near, far):
+    """The columns x, y, z and time (4, M) of the points between `near` and `far`, ring by ring, and where rings begin (R+1,)."""
+    n = xyz.shape[0]
+    near2, far2 = np.float32(near * near), np.float32(far * far)
+    inside = np.empty(n, np.bool_)
+    for i in range(n):  # without a branch, as most loops here: several points are done at once
+        x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        d2 = x * x + y * y + z * z
+        inside[i] = (d2 > near2) & (d2 < far2) & (ring[i] >= 0) & (ring[i] < n_rings)  # NaN compares false
+    timed = offset.shape[0] == n
+    if timed:
+        for i in range(n):
+            inside[i] &= offset[i] == offset[i]  # NaN: nobody knows when
+    starts = np.zeros(n_rings + 1, np.int64)
+    for i in range(n):
+        if inside[i]:
+            starts[ring[i] + 1] += 1
+    for k in range(n_rings):
+        starts[k + 1] += starts[k]
+    fill = starts[:-1].copy()
+    q = np.zeros((4, starts[n_rings]), np.float32)
+    for i in range(n):
+        if inside[i]:
+            g = ring[i]
+            k = fill[g]
+            fill[g] = k + 1
+            q[0, k], q[1, k], q[2, k] = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+            if timed:
+                q[3, k] = offset[i]
+    return q, starts
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _once(q, starts):
+    """Drops, in place, points that repeat the one before them in their ring; the rings' new starts."""
+    x, y, z = q[0], q[1], q[2]
+    again = 0
+    for i in range(1, x.shape[0]):
+        again += (x[i] == x[i - 1]) & (y[i] == y[i - 1]) & (z[i] == z[i - 1])
+    if again == 0:
+        return starts
+    out = starts.copy()
+    m = 0
+    for k in range(starts.shape[0] - 1):
+        out[k] = m
+        for i in range(starts[k], starts[k + 1]):
+            if i > starts[k] and x[i] == q[0, m - 1] and y[i] == q[1, m - 1] and z[i] == q[2, m - 1]:
+                continue
+            for c in range(4):
+                q[c, m] = q[c, i]
+            m += 1
+    out[-1] = m
+    return out
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _jumbled(x, y):
+    """Whether a ring's points (M,) are in no order. Firing order is azimuth order but for the place where the turn closes; a
+    ring that comes round more than twice is several in one.
+    """
+    left, right, rounds = 0, 0, 0
+    zero = np.float32(0.0)
+    for i in range(1, x.shape[0]):
+        side = x[i - 1] * y[i] - y[i - 1] * x[i]
+        left += side > zero
+        right += side < zero
+        rounds += (x[i] < zero) & ((y[i] < zero) != (y[i - 1] < zero))
+    return min(left, right) > 2 + x.shape[0] // 200 or rounds > 3
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _moved(q, base_T_lidar, twist):
+    """Takes points `q` (4, M) of the sensor, in place, to where the base has them at the stamp."""
+    T, v = base_T_lidar.astype(np.float32), twist.astype(np.float32)
+    r00, r01, r02, tx = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
+    r10, r11, r12, ty = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    r20, r21, r22, tz = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
+    vx, vy, vz, wx, wy, wz = v[0], v[1], v[2], v[3], v[4], v[5]
+    half = np.float32(0.5)
+    px, py, pz, pt = q[0], q[1], q[2], q[3]
+    for k in range(px.shape[0]):
+        x, y, z, t = px[k], py[k], pz[k], pt[k]
+        bx = r00 * x + r01 * y + r02 * z + tx
+        by = r10 * x + r11 * y + r12 * z + ty
+        bz = r20 * x + r21 * y + r22 * z + tz
+        # p + t (v + w x p) + t²/2 w x (v + w x p)
+        ux, uy, uz = vx + wy * bz - wz * by, vy + wz * bx - wx * bz, vz + wx * by - wy * bx
+        h = half * t * t
+        px[k] = bx + t * ux + h * (wy * uz - wz * uy)
+        py[k] = by + t * uy + h * (wz * ux - wx * uz)
+        pz[k] = bz + t * uz + h * (wx * uy - wy * ux)
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _seen_from(q, eye_x, eye_y):
+    """Points (M, 3), horizontal range (M,) and direction (M, 2) from the sensor of points `q` (4, M) of the base."""
+    px, py, pz = q[0], q[1], q[2]
+    m = px.shape[0]
+    p, r, u = np.empty((m, 3), np.float32), np.empty(m, np.float32), np.empty((m, 2), np.float32)
+    tx, ty, one, least = np.float32(eye_x), np.float32(eye_y), np.float32(1.0), np.float32(1e-6)
+    for k in range(m):
+        x, y = px[k] - tx, py[k] - ty
+        r[k] = np.sqrt(max(x * x + y * y, least))  # straight above or below
+    for k in range(m):
+        near = one / r[k]
+        u[k, 0], u[k, 1] = (px[k] - tx) * near, (py[k] - ty) * near
+    for k in range(m):
+        p[k, 0], p[k, 1], p[k, 2] = px[k], py[k], pz[k]
+    return p, r, u
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _lowest(q):
+    """Lowest point (2 HALF, 2 HALF) of each ground cell, 1e9 where there is none."""
+    px, py, pz = q[0], q[1], q[2]
+    m = px.shape[0]
+    cell = np.empty(m, np.int32)
+    side, zero, top = np.float32(HALF + 1), np.float32(0.0), np.float32(2 * HALF + 1)
+    row = np.int32(2 * HALF + 2)
+    for k in range(m):  # cells of the rim are for all that is outside
+        i, j = min(max(px[k] + side, zero), top), min(max(py[k] + side, zero), top)
+        cell[k] = np.int32(i) * row + np.int32(j)
+    low = np.full((2 * HALF + 2) * (2 * HALF + 2), np.float32(1e9))
+    for k in range(m):
+        c = np.uint32(cell[k])
+        low[c] = min(low[c], pz[k])
+    return low.reshape(2 * HALF + 2, 2 * HALF + 2)[1:-1, 1:-1].copy()
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
     """Points in ring order: base-frame xyz (M, 3), horizontal range from the sensor (M,), horizontal direction from it (M, 2),
     ring starts (R+1,), and the lowest point (2 HALF, 2 HALF) of each ground cell. A point that repeats the one before it in
@@ -104,102 +232,40 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
     `offset` (N,) s or empty; `twist` (6,) of the base. First the motion during the sweep is taken out, to second
     order in the sweep's time; then the points are where they were at the stamp, seen from the base then.
     """
-    n = xyz.shape[0]
-    R = base_T_lidar[:3, :3].astype(np.float32)
-    tx, ty, tz = np.float32(base_T_lidar[0, 3]), np.float32(base_T_lidar[1, 3]), np.float32(base_T_lidar[2, 3])
-    v = twist.astype(np.float32)
-    vx, vy, vz, wx, wy, wz = v[0], v[1], v[2], v[3], v[4], v[5]
-    half = np.float32(0.5)
-    timed = offset.shape[0] == n
-    count = np.zeros(n_rings + 1, np.int64)
-    near2, far2 = np.float32(near * near), np.float32(far * far)
-    inside = np.empty(n, np.bool_)
-    for i in range(n):
-        x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-        d2 = x * x + y * y + z * z
-        inside[i] = (d2 > near2) & (d2 < far2)  # NaN compares false
-    before = np.zeros((n_rings, 3), np.float32)
-    for i in range(n):
-        k = ring[i]
-        inside[i] &= (k >= 0) & (k < n_rings)
-        if timed and offset[i] != offset[i]:  # NaN: nobody knows when
-            inside[i] = False
-        if inside[i]:
-            if before[k, 0] == xyz[i, 0] and before[k, 1] == xyz[i, 1] and before[k, 2] == xyz[i, 2]:
-                inside[i] = False
-                continue
-            before[k, 0], before[k, 1], before[k, 2] = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-            count[k + 1] += 1
+    q, starts = _by_ring(xyz, ring, offset, n_rings, near, far)
+    starts = _once(q, starts)
+    q = q[:, : starts[n_rings]].copy()
+    # Order is judged before the motion is taken out: near leaves and far ground shift differently.
+    jumbled = np.zeros(n_rings, np.bool_)
     for k in range(n_rings):
-        count[k + 1] += count[k]
-    starts = count.copy()
-    m = count[n_rings]
-    p = np.empty((m, 3), np.float32)
-    r = np.empty(m, np.float32)
-    u = np.empty((m, 2), np.float32)
-    fill = count[:-1].copy()
-    before[:] = 0.0
-    turns = np.zeros((n_rings, 2), np.int64)
-    rounds = np.zeros(n_rings, np.int64)
-    low = np.full((2 * HALF, 2 * HALF), 1e9, np.float32)
-    for i in range(n):
-        if not inside[i]:
-            continue
-        g = ring[i]
-        k = fill[g]
-        fill[g] = k + 1
-        x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-        # Order is judged before the motion is taken out: near leaves and far ground shift differently.
-        side = before[g, 0] * y - before[g, 1] * x
-        turns[g, 0] += side > 0
-        turns[g, 1] += side < 0
-        rounds[g] += (x < 0) & ((y < 0) != (before[g, 1] < 0))
-        before[g, 0], before[g, 1] = x, y
-        bx = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z + tx
-        by = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z + ty
-        bz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z + tz
-        if timed:
-            t = offset[i]
-            # p + t (v + w x p) + t²/2 w x (v + w x p)
-            ux, uy, uz = vx + wy * bz - wz * by, vy + wz * bx - wx * bz, vz + wx * by - wy * bx
-            h = half * t * t
-            bx += t * ux + h * (wy * uz - wz * uy)
-            by += t * uy + h * (wz * ux - wx * uz)
-            bz += t * uz + h * (wx * uy - wy * ux)
-        p[k, 0], p[k, 1], p[k, 2] = bx, by, bz
-        ex, ey = bx - tx, by - ty
-        flat = max(np.sqrt(ex * ex + ey * ey), np.float32(1e-3))  # straight above or below
-        one = np.float32(1.0) / flat
-        r[k] = flat
-        u[k, 0], u[k, 1] = ex * one, ey * one
-        cx, cy = int(bx + HALF), int(by + HALF)
-        if bx > -HALF and by > -HALF and cx < 2 * HALF and cy < 2 * HALF and bz < low[cx, cy]:
-            low[cx, cy] = bz
+        jumbled[k] = _jumbled(q[0, starts[k] : starts[k + 1]], q[1, starts[k] : starts[k + 1]])
+    _moved(q, base_T_lidar, twist)
+    p, r, u = _seen_from(q, base_T_lidar[0, 3], base_T_lidar[1, 3])
     for k in range(n_rings):
         lo, hi = starts[k], starts[k + 1]
-        if hi - lo < 3:
-            continue
-        # Firing order is azimuth order but for the place where the turn closes; anything else is sorted. A ring that
-        # comes round more than twice is several in one.
-        if min(turns[k, 0], turns[k, 1]) > 2 + (hi - lo) // 200 or rounds[k] > 3:
+        if jumbled[k] and hi - lo > 2:
             order = np.argsort(np.arctan2(u[lo:hi, 1], u[lo:hi, 0]))
             p[lo:hi] = p[lo:hi][order]
             r[lo:hi] = r[lo:hi][order]
             u[lo:hi] = u[lo:hi][order]
-    return p, r, u, starts, low
+    return p, r, u, starts, _lowest(q)
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def angle_between(u, i, j):
     """Angle (sine of it) between two points of a ring as the sensor sees them."""
     return abs(u[i, 0] * u[j, 1] - u[i, 1] * u[j, 0])
 
 
-@njit(cache=True)
+SAMPLED_STEPS = 500
+"""Pairs of neighbouring firings that tell the angle between them."""
+
+
+@njit(cache=True, error_model="numpy")
 def angular_step(u, starts):
     """Angle between neighbouring firings, rad: the commonest small step within rings, from a sample of them."""
     m = u.shape[0]
-    every = max(1, m // 1200)
+    every = max(1, m // SAMPLED_STEPS)
     out = np.empty(m // every + len(starts))
     n = 0
     for k in range(len(starts) - 1):

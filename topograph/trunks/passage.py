@@ -24,7 +24,11 @@ LOW, HIGH = 0.4, 1.6
 """Heights between which a beam that passes contradicts a trunk, m: above weeds, below crowns."""
 
 
-@njit(cache=True, fastmath=FAST)
+NONE = np.uint64(0xFFFFFFFFFFFFFFFF)
+"""A bin without a point: further than any."""
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def bin_of(x, y):
     """Direction of (x, y), 0 to BINS - 1."""
     a = abs(x) + abs(y)
@@ -39,7 +43,7 @@ def bin_of(x, y):
     return k if k < BINS else BINS - 1
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def wrapped(b):
     """A bin that may have gone once past either end."""
     if b < 0:
@@ -47,41 +51,41 @@ def wrapped(b):
     return b - BINS if b >= BINS else b
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def ring_image(p, r, u, starts, eye):
     """Nearest horizontal range (R, BINS) of what each ring met in each direction (0: no return), and the slope
     (R, BINS) of the beam that met it, metres of height per metre.
     """
-    rings = starts.shape[0] - 1
-    near = np.zeros((rings, BINS), np.float32)
-    slope = np.zeros((rings, BINS), np.float32)
-    ez, zero, two, four, scale = (
-        np.float32(eye[2]),
-        np.float32(0.0),
-        np.float32(2.0),
-        np.float32(4.0),
-        np.float32(BINS / 4.0),
-    )
+    rings, m = starts.shape[0] - 1, r.shape[0]
+    zero, two, four = np.float32(0.0), np.float32(2.0), np.float32(4.0)
+    scale, end = np.float32(BINS / 4.0), np.float32(BINS)
+    bins = np.empty(m, np.int32)
+    for i in range(m):  # bin_of in single precision, without a branch: several points are done at once
+        x, y = u[i, 0], u[i, 1]
+        t = y / (abs(x) + abs(y))
+        t = two - t if x < zero else (four + t if y < zero else t)
+        t *= scale
+        bins[i] = np.int32(t) if (t >= zero) & (t < end) else np.int32(0)  # rounding at the end of the turn; NaN
+    # Range and number of a point in one word: the nearest point of a bin is the least word, found without a branch.
+    bits = r.view(np.uint32)
+    words = np.full((rings, BINS), NONE)
     for k in range(rings):
+        row = words[k]
         for i in range(starts[k], starts[k + 1]):
-            x, y = u[i, 0], u[i, 1]
-            a = abs(x) + abs(y)
-            if not a > zero:  # NaN too
-                continue
-            t = y / a  # bin_of, inlined in single precision: this is a loop over all points
-            if x < zero:
-                t = two - t
-            elif y < zero:
-                t = four + t
-            b = min(int(t * scale), BINS - 1)
-            q = near[k, b]
-            if q == zero or r[i] < q:
-                near[k, b] = r[i]
-                slope[k, b] = (p[i, 2] - ez) / r[i]
+            b = np.uint32(bins[i])
+            row[b] = min(row[b], (np.uint64(bits[i]) << np.uint64(32)) | np.uint64(i))
+    near, slope = np.zeros((rings, BINS), np.float32), np.zeros((rings, BINS), np.float32)
+    ez = np.float32(eye[2])
+    for k in range(rings):
+        for b in range(BINS):
+            if words[k, b] != NONE:
+                nearest = np.uint32(words[k, b])
+                near[k, b] = r[nearest]
+                slope[k, b] = (p[nearest, 2] - ez) / r[nearest]
     return near, slope
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _towards(b):
     """A vector in the direction of (broken) bin `b`: back from the diamond angle."""
     t = 4.0 * b / BINS
@@ -94,7 +98,7 @@ def _towards(b):
     return t - 3.0, t - 4.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _cells(first, last):
     """A word with the bits of the cells from `first` up to before `last`, m."""
     i0, i1 = max(int(first), 0), min(int(np.floor(last)), CELLS)
@@ -104,7 +108,7 @@ def _cells(first, last):
     return word & ~((np.uint32(1) << np.uint32(i0)) - np.uint32(1))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def passage(near, slope, eye, plane, grid):
     """Places seen through: (SECTORS,) words, bit i of one is set when all beams of that direction that could have met
     a trunk i to i + 1 m away went on, at the height of a trunk. Directions are in the base's axes, about the sensor.
@@ -163,7 +167,7 @@ TRUNK_HIT, TRUNK_PASS, TRUNK_RINGS, AXIS_HIT, AXIS_PASS, CROWN_HIT, CROWN_SEEN, 
 SEEN_SIZE = 8
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def crossings(tangent, R, eye, x, y, z, lx, ly, out):
     """Height (m), horizontal distance from the sensor (m), direction (x, y) of the places (rings, 4) `out` where the rings cross a
     column through (x, y, z) with slope (lx, ly); False where rings run along it.
@@ -189,7 +193,7 @@ CROWN_STEP = 0.08
 """Directions nearer to each other than this at a crown's range are not looked at one by one, m."""
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def look_at(near, crossed, ground, radius, highest, out):
     """What the rings say of a column that they cross as in `crossed` (rings, 4): (SEEN_SIZE,) `out`.
 

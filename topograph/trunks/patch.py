@@ -26,7 +26,7 @@ FINEST = 0.07
 _LEVELS, _SIDES = np.array(LEVELS), np.array(SIDES)
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def look_at_patch(near, crossed, ground, radius, out):
     """(PATCH_SIZE,) `out` of a column that the rings cross as in `crossed` (rings, 4), see passage.py: for each height and
     distance beside it the balance of beams that met something at its range and of those that passed, -1 to 1, and how much
@@ -47,23 +47,21 @@ def look_at_patch(near, crossed, ground, radius, out):
         width = (4.0 / BINS) * a * a / d  # of a bin of the diamond angle, in metres across
         every = max(int(FINEST / width), 1)
         first, last = np.float32(d - 0.2 - radius - 0.01 * d), np.float32(d + 0.2 + radius + 0.01 * d)
-        behind = np.float32(d + MARGIN)
+        behind = max(np.float32(d + MARGIN), last)
         sky = np.float32(0.5) if h > 1.8 else zero  # no return: the sky; lower down nobody knows
         ring = near[k]
         q = 0
         for column in range(COLUMNS):
-            end = int((radius + _SIDES[column]) / width)
+            end = min(int((radius + _SIDES[column]) / width), BINS // 2 - 1)
             hits, passes = zero, zero
-            while q <= end and q < BINS // 2:
-                for side in range(1 if q == 0 else 2):
-                    v = ring[wrapped(b + q if side == 0 else b - q)]
-                    if v == zero:
-                        passes += sky
-                    elif v > first:
-                        if v < last:
-                            hits += one
-                        elif v > behind:
-                            passes += one
+            while q <= end:  # sums without a branch: what a beam met is as good as a toss
+                v = ring[wrapped(b + q)]
+                hits += (v > first) & (v < last) & (v > zero)
+                passes += (v > behind) + sky * (v == zero)
+                if q > 0:
+                    v = ring[wrapped(b - q)]
+                    hits += (v > first) & (v < last) & (v > zero)
+                    passes += (v > behind) + sky * (v == zero)
                 q += every
             met[row, column] += hits
             through[row, column] += passes

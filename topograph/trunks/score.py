@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from topograph.errors import InputError
 from topograph.geometry import Array
+from topograph.trunks.beside import judged_beside, prepared
 from topograph.trunks.features import FEATURES
 
 KINDS = ("tree", "post", "other")
@@ -84,11 +85,9 @@ def network(file: str = "") -> Network:
 
 def kinds(features: Array, n: Network) -> Array:
     """Log-probabilities (C, 3) of KINDS of candidates of one sweep with `features` (C, len(FEATURES))."""
-    bad = np.asarray(~np.isfinite(features).all(axis=1))
-    known = np.where(bad[:, None], n.mean, features)  # one of them must not speak for the others
-    log_p = log_softmax(judge(normalised(known, n.mean, n.deviation), n.layers))
+    x, far = prepared(features, n.mean, n.deviation, n.low, n.high, CLIP)
+    log_p = log_softmax(judge(x, n.layers))
     # Outside of what was trained on nobody knows: the answer is drawn towards the prior, and many sightings decide.
-    far = bad | ((known < n.low) | (known > n.high)).any(axis=1)
     log_p[far] = log_softmax(KIND_PRIOR + TEMPER * (log_p[far] - KIND_PRIOR))
     return log_p
 
@@ -106,12 +105,7 @@ def judge(x: NDArray[np.float32], layers: Layers) -> Array:
     """
     h = np.maximum(_forward(x, layers.describe), 0.0)
     z = _forward(h, layers.alone)
-    log_p = log_softmax(z)
-    p = np.exp(log_p)
-    others = np.maximum(p[:, :2].sum(axis=0) - p[:, :2], 0.0)
-    weighted = p[:, TREE, None] * h
-    mean = (weighted.sum(axis=0) - weighted) / (others[:, TREE, None] + ALONE)
-    seen = np.concatenate([h, np.maximum(log_p, -LEAST), np.log1p(others), mean], axis=1)
+    seen = judged_beside(h, z, ALONE, LEAST)
     return np.asarray(z + _forward(seen, layers.beside), float)
 
 

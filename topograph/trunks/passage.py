@@ -77,11 +77,11 @@ def ring_image(p, r, u, starts, eye):
     near, slope = np.zeros((rings, BINS), np.float32), np.zeros((rings, BINS), np.float32)
     ez = np.float32(eye[2])
     for k in range(rings):
-        for b in range(BINS):
-            if words[k, b] != NONE:
-                nearest = np.uint32(words[k, b])
-                near[k, b] = r[nearest]
-                slope[k, b] = (p[nearest, 2] - ez) / r[nearest]
+        for column in range(BINS):
+            if words[k, column] != NONE:
+                nearest = np.uint32(words[k, column])
+                near[k, column] = r[nearest]
+                slope[k, column] = (p[nearest, 2] - ez) / r[nearest]
     return near, slope
 
 

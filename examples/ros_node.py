@@ -13,13 +13,13 @@ from topograph import store
 from topograph.bags import Odometry, decode_scan
 from topograph.geometry import from_xyz_rpy, to_quaternion
 from topograph.localize import Localizer
-from topograph.trunks import TrunksConfig
-from topograph.trunks.detector import Detector
+from topograph.trunks.frontend import FrontEnd
 
 rclpy.init()
 node = rclpy.create_node("topograph")
 base_T_lidar = from_xyz_rpy(0.3, 0.0, 0.8, 0.0, 0.0, 0.0)  # yours
-localizer = Localizer(store.load(Path(sys.argv[1])), detect=Detector(base_T_lidar, TrunksConfig()))
+front_end = FrontEnd(mount=lambda frame: base_T_lidar, find=lambda frame: None)
+localizer = Localizer(store.load(Path(sys.argv[1])), front_end=front_end)
 poses = node.create_publisher(PoseWithCovarianceStamped, "map_pose", 10)
 waiting: list[Odometry] = []
 

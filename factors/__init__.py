@@ -4,9 +4,9 @@ Every function takes plain numbers and arrays, checks them (GTSAM does not), and
 Poses are 4x4 matrices `map_T_robot`; tangent vectors and their covariances are (rotation, translation), body frame.
 """
 
-from factors.gnss import fix, fix_linear
+from factors.gnss import fix, fix_linear, fixes
 from factors.ground import level
-from factors.heading import heading
+from factors.heading import heading, headings
 from factors.imu import ImuNoise, bias_walk, preintegrate, preintegrated
 from factors.noise import Kernel, gaussian, robust, sigmas
 from factors.odometry import odometries, odometry, odometry_2d
@@ -22,9 +22,11 @@ __all__ = [
     "bias_walk",
     "fix",
     "fix_linear",
+    "fixes",
     "from_pose3",
     "gaussian",
     "heading",
+    "headings",
     "level",
     "odometries",
     "odometry",

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors.noise import Kernel, gaussian, robust
+from factors.noise import Kernel, gaussians
 
 Array = NDArray[np.float64]
 
@@ -19,10 +19,22 @@ def fix(key: int, map_p_antenna: ArrayLike, robot_p_antenna: ArrayLike, cov: Arr
     Raises:
         ValueError: not finite.
     """
-    z, lever = np.asarray(map_p_antenna, float), np.asarray(robot_p_antenna, float)
-    if not (np.isfinite(z).all() and np.isfinite(lever).all()):
+    z, lever, c = (np.asarray(v, float)[None] for v in (map_p_antenna, robot_p_antenna, cov))
+    return fixes([key], z, lever, c, kernel)[0]
+
+
+def fixes(keys: list[int], map_p_antenna: Array, robot_p_antenna: Array, cov: Array, kernel: Kernel) -> list[Any]:
+    """`fix` for N fixes at once: places and lever arms (N, 3), covariances (N, 3, 3); checked in bulk.
+
+    Raises:
+        ValueError: as `fix`.
+    """
+    if not (np.isfinite(map_p_antenna).all() and np.isfinite(robot_p_antenna).all()):
         raise ValueError("a fix and its lever arm must be finite")
-    return gtsam.GPSFactorArm(key, z, lever, robust(gaussian(cov), kernel))
+    return [
+        gtsam.GPSFactorArm(k, z, lever, noise)
+        for k, z, lever, noise in zip(keys, map_p_antenna, robot_p_antenna, gaussians(cov, kernel), strict=True)
+    ]
 
 
 def fix_linear(

@@ -6,9 +6,12 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from factors.noise import Kernel, gaussian, robust
+from factors.noise import Kernel, gaussians
+from factors.trunk import bearing_basis
+
+Array = NDArray[np.float64]
 
 
 def heading(
@@ -21,12 +24,28 @@ def heading(
     Raises:
         ValueError: not finite, or sigma not positive.
     """
-    if not (np.isfinite(yaw) and np.isfinite(sigma) and sigma > 0):
+    direction = np.asarray(robot_direction, float)[None]
+    return headings([key], np.array([yaw]), direction, np.array([sigma]), kernel, steepest=steepest)[0]
+
+
+def headings(
+    keys: list[int], yaw: Array, robot_direction: Array, sigma: Array, kernel: Kernel, *, steepest: float = 0.5
+) -> list[Any]:
+    """`heading` for N headings at once: azimuths and deviations (N,), directions (N, 3); checked in bulk.
+
+    Raises:
+        ValueError: as `heading`.
+    """
+    if not (np.isfinite(yaw).all() and np.isfinite(sigma).all() and (sigma > 0).all()):
         raise ValueError("a heading must be finite and its sigma positive")
-    reference = gtsam.Unit3(np.array([np.cos(yaw), np.sin(yaw), 0.0]))
-    basis = np.asarray(reference.basis())  # (3, 2)
-    sideways = basis.T @ np.array([-np.sin(yaw), np.cos(yaw), 0.0])
-    upwards = basis.T @ np.array([0.0, 0.0, 1.0])
-    cov = sigma**2 * np.outer(sideways, sideways) + steepest**2 * np.outer(upwards, upwards)
-    direction = gtsam.Unit3(np.asarray(robot_direction, float))
-    return gtsam.AttitudeFactorPose3(key, reference, robust(gaussian(cov), kernel), direction)
+    c, s, zero = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))
+    reference = np.stack([c, s, zero], axis=1)
+    basis = bearing_basis(reference, exact=True)
+    sideways, upwards = (basis * np.stack([-s, c, zero], axis=1)[:, :, None]).sum(axis=1), basis[:, 2]
+    cov = sigma[:, None, None] ** 2 * sideways[:, :, None] * sideways[:, None, :]
+    cov += steepest**2 * upwards[:, :, None] * upwards[:, None, :]
+    unit, factor = gtsam.Unit3, gtsam.AttitudeFactorPose3
+    return [
+        factor(k, unit(z), noise, unit(d))
+        for k, z, d, noise in zip(keys, reference, robot_direction, gaussians(cov, kernel), strict=True)
+    ]

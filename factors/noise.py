@@ -63,12 +63,25 @@ def gaussian(cov: ArrayLike) -> Any:
     Raises:
         ValueError: it is not finite, symmetric and positive definite.
     """
-    c = np.asarray(cov, float)
-    if not np.isfinite(c).all() or not np.allclose(c, c.T, atol=1e-9 * max(1.0, float(np.abs(c).max()))):
+    return gaussians(np.asarray(cov, float)[None], Kernel("none"))[0]
+
+
+def gaussians(cov: NDArray[np.float64], kernel: Kernel) -> list[Any]:
+    """Gaussian noises of covariances (N, d, d) under a robust loss, checked in bulk.
+
+    Raises:
+        ValueError: as `gaussian`.
+    """
+    scale = np.maximum(1.0, np.abs(cov).max(axis=(1, 2), initial=0.0))[:, None, None]
+    if not np.isfinite(cov).all() or (np.abs(cov - np.swapaxes(cov, 1, 2)) > 1e-9 * scale + 1e-5 * np.abs(cov)).any():
         raise ValueError("a covariance must be finite and symmetric")
-    if np.linalg.eigvalsh(c)[0] <= 0:
+    if len(cov) and np.linalg.eigvalsh(cov)[:, 0].min() <= 0:
         raise ValueError("a covariance must be positive definite")
-    return gtsam.noiseModel.Gaussian.Covariance(c)
+    create, estimator = gtsam.noiseModel.Gaussian.Covariance, kernel.estimator()
+    if estimator is None:
+        return [create(c) for c in cov]
+    robustly = gtsam.noiseModel.Robust.Create
+    return [robustly(estimator, create(c)) for c in cov]
 
 
 def robust(model: Any, kernel: Kernel) -> Any:

@@ -53,9 +53,11 @@ def trunks(pose_keys: list[int], point_keys: list[int], robot_p_trunk: Array, co
     return out
 
 
-def bearing_basis(unit: Array) -> Array:
-    """Tangent basis (N, 3, 2) that gtsam.Unit3 uses at directions (N, 3): across the least of the axes."""
-    least = np.abs(np.round(unit, 12)).argmin(axis=1)  # rounding must not decide between equal axes
+def bearing_basis(unit: Array, *, exact: bool = False) -> Array:
+    """Tangent basis (N, 3, 2) that gtsam.Unit3 uses at directions (N, 3): across the least of the axes. `exact`: the directions are
+    those that gtsam will have, to the last bit; else rounding must not decide between equal axes.
+    """
+    least = np.abs(unit if exact else np.round(unit, 12)).argmin(axis=1)
     first = np.cross(unit, np.eye(3)[least])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     second = np.cross(unit, first)

@@ -9,7 +9,7 @@ import scipy.io
 
 import factors
 from factors import Kernel
-from topograph.estimate.solver import levenberg_marquardt
+from topograph.estimate.solver import optimised
 from topograph.geometry import fit_rigid_2d
 
 DATA = Path(gtsam.__file__).parent / "Data"
@@ -51,7 +51,7 @@ def test_plaza2_range_only() -> None:
         for b, n in beacons.items():
             mine = td[:, 2] == b
             v.insert(10_000 + n, _trilaterate(nodes[at[mine], :2], scale * td[mine, 3]))
-        out = levenberg_marquardt(g, v, 60)
+        out = optimised(g, v, 60)
         xy = gtsam.utilities.extractPose2(out)[:, :2]
         return g.error(out), xy
 
@@ -119,7 +119,7 @@ def test_victoria_park_with_associations() -> None:
     isam.update(pending, fresh)
     for _ in range(3):
         isam.update()
-    out = levenberg_marquardt(graph, isam.calculateEstimate(), 100, 1e-8)
+    out = optimised(graph, isam.calculateEstimate(), 100, 1e-8)
     assert graph.error(out) <= 463.5
 
 

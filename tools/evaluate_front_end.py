@@ -18,14 +18,12 @@ from pathlib import Path
 import numpy as np
 from recordings import map_at
 
-from topograph.bags import Recording, Scan, Trunks
+from topograph.bags import Imu, Odometry, Recording, Scan, Trunks
 from topograph.config import Config
 from topograph.evaluate import Truth, trunk_metrics
 from topograph.evaluate.metrics import match
 from topograph.geometry import interpolate, inverse, transform
-from topograph.motion import StreamsBuilder, twist_during
-from topograph.trunks.detector import Detector
-from topograph.trunks.thesis import ThesisDetector
+from topograph.trunks.frontend import FrontEnd
 
 EDGES = (0.0, 10.0, 20.0, 30.0)
 
@@ -52,15 +50,12 @@ def run(bag: Path, every: int, front_end: str, shuffle: bool, no_time: bool) -> 
     config = Config()
     trunks: list[Trunks] = []
     with Recording([bag]) as r:
-        builder, pending, n = StreamsBuilder(), [], 0
-        imu = r.frames.get("imu_link")[:3, :3]
-        mount = r.frames.get("velodyne")
-        detect = (
-            ThesisDetector(mount, config.thesis_trunks) if front_end == "thesis" else Detector(mount, config.trunks)
-        )
+        trunks_config = replace(config.trunks, front_end=front_end)
+        door, pending, n = FrontEnd(r.frames.get, r.frames.find, trunks_config, config.thesis_trunks), [], 0
         for _, m in r.messages():
             if not isinstance(m, Scan):
-                builder.add(m)
+                if isinstance(m, (Odometry, Imu)):
+                    door.hear(m)
                 continue
             pending.append(m)
             if len(pending) < 2:
@@ -74,8 +69,7 @@ def run(bag: Path, every: int, front_end: str, shuffle: bool, no_time: bool) -> 
                 s = Scan(s.stamp_ns, s.frame, s.xyz[order], None, None if s.offset is None else s.offset[order], None)
             if no_time:
                 s = replace(s, offset=None)
-            twist, _ = twist_during(s.stamp_ns - 100_000_000, s.stamp_ns, builder.odometry, builder.imu, imu)
-            trunks.append(detect(s, twist))
+            trunks.append(door.see(s))
     stamps = np.array([t.stamp_ns for t in trunks])
     _, table = trunk_metrics(truth, stamps, [t.p[t.score >= 0] for t in trunks], edges=EDGES)
     return Result(bag.stem, table, nees_of(truth, trunks), *mapped(truth, trunks, config))

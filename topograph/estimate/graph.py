@@ -23,7 +23,7 @@ from topograph.estimate import covariance
 from topograph.estimate.inertia import Inertia, inertia
 from topograph.estimate.initial import initial_path, yaw_of_direction
 from topograph.estimate.problem import Estimate, EstimateConfig, Offset, Problem
-from topograph.estimate.solver import levenberg_marquardt, with_big_stack
+from topograph.estimate.solver import optimised, ordering_of, with_big_stack
 from topograph.geometry import Array, inverse, log, transform, wrap
 from topograph.trees import Sightings
 
@@ -86,20 +86,20 @@ def _solve(problem: Problem, config: EstimateConfig, *, quick: bool, patient: bo
     steps, tolerance = (3 * config.iterations, 1e-6)
     if quick:
         steps, tolerance = (3 * config.iterations, 1e-5) if patient else (10, 1e-3)
-    values = levenberg_marquardt(graph_of(problem, first, config, inert), values, steps, tolerance)
+    values = optimised(graph_of(problem, first, config, inert), values, steps, tolerance)
     if quick:
         return _estimate(problem, config, values, first, None, time.perf_counter() - began)
     scales = _learned_scales(problem, values, first) if config.learn_scale else (1.0, 1.0, 1.0)
     tukey = Kernel("tukey", config.tukey)
     last = Pass(tukey, tukey, 0.0, *scales)
-    values = levenberg_marquardt(graph_of(problem, last, config, inert), values, config.iterations)
+    values = optimised(graph_of(problem, last, config, inert), values, config.iterations)
     for _ in range(RELEARNT if config.learn_scale else 0):
         scales = _learned_scales(problem, values, last)
         if scales[0] > STALE * last.trunk_scale and scales[1] > STALE * last.fix_scale:
             break
         less = (min(scales[0], last.trunk_scale), min(scales[1], last.fix_scale))
         last = replace(last, trunk_scale=less[0], fix_scale=less[1], alike=scales[2])
-        values = levenberg_marquardt(graph_of(problem, last, config, inert), values, config.iterations)
+        values = optimised(graph_of(problem, last, config, inert), values, config.iterations)
     values, linear = with_big_stack(lambda: _polish(problem, last, config, inert, values))
     out = _estimate(problem, config, values, last, linear, time.perf_counter() - began)
     try:
@@ -131,9 +131,7 @@ def _poses_alone(problem: Problem, poses: Array, config: EstimateConfig) -> Arra
     values = _values(problem, poses, np.zeros((0, 3)), None)
     if len(problem.fixes.keyframe) >= 3:
         for p in (Pass(_NONE, Kernel("huber", 1.345), 1.0), Pass(_NONE, Kernel("cauchy", 1.0), 0.1)):
-            values = levenberg_marquardt(
-                graph_of(problem, p, config, None, without=("trunk", "tree")), values, 30, 1e-4
-            )
+            values = optimised(graph_of(problem, p, config, None, without=("trunk", "tree")), values, 30, 1e-4)
     return _path(problem, values)
 
 
@@ -199,9 +197,8 @@ def _links(problem: Problem) -> Iterator[Any]:
 
 def _headings(problem: Problem, config: EstimateConfig) -> Iterator[Any]:
     h = problem.headings
-    for k, direction, yaw, sigma in zip(h.keyframe.tolist(), h.direction, h.yaw, h.sigma, strict=True):
-        least = max(float(sigma), config.heading_floor)
-        yield factors.heading(X + k, float(yaw), direction, least, Kernel("huber", 1.345))
+    sigma = np.maximum(h.sigma, config.heading_floor)
+    yield from factors.headings((X + h.keyframe).tolist(), h.yaw, h.direction, sigma, Kernel("huber", 1.345))
 
 
 def _trunks(problem: Problem, p: Pass) -> Iterator[Any]:
@@ -273,8 +270,7 @@ def _fixes(problem: Problem, p: Pass) -> Iterator[Any]:
     tall[:, 0, 0] = tall[:, 1, 1] = free
     tall[:, 2, 2] = cov[:, 2, 2]
     for part in (flat, tall):
-        for k, lever, z, c in zip(f.keyframe.tolist(), f.keyframe_p_antenna, f.map_p_antenna, part, strict=True):
-            yield factors.fix(X + k, z, lever, c, p.fix)
+        yield from factors.fixes((X + f.keyframe).tolist(), f.map_p_antenna, f.keyframe_p_antenna, part, p.fix)
 
 
 def _fix_cov(problem: Problem, p: Pass) -> Array:
@@ -349,8 +345,13 @@ def _learned_scales(problem: Problem, values: Any, p: Pass) -> tuple[float, floa
     return trunk, fix, alike
 
 
+POLISHED = 2e-5
+"""Root mean square of a last step, m and rad: steps shrink, and a hundredth of this is what is left."""
+
+
 def _polish(problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | None, values: Any) -> tuple[Any, Any]:
-    """Gauss-Newton with Cartesian trunk residuals until steps are below a micrometre; the values and the last system."""
+    """Gauss-Newton with Cartesian trunk residuals until steps are below `POLISHED`; the values and the last system."""
+    ordering = None
     rest = graph_of(problem, p, config, inert, without=("trunk",))
     s = problem.sightings
     keys_x, keys_l = (X + s.keyframe).tolist(), (L + s.tree).tolist()
@@ -361,9 +362,10 @@ def _polish(problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | 
         if len(s):
             path, trees = _path(problem, values), _trees(problem, values)
             factors.trunk_linear(linear, keys_x, keys_l, path[s.keyframe], trees[s.tree], s.p, cov, p.trunk)
-        step = linear.optimize()
+        ordering = ordering or ordering_of(linear, values.size())
+        step = linear.optimize(ordering)
         values = values.retract(step)
-        if step.norm() < 1e-7 * max(1.0, np.sqrt(values.size())):
+        if step.norm() < POLISHED * np.sqrt(values.size()):
             break
     return values, linear
 

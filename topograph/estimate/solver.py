@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -36,17 +37,58 @@ def with_big_stack(work: Callable[[], _T]) -> _T:
     return result[0]
 
 
-def levenberg_marquardt(graph: Any, values: Any, iterations: int, tolerance: float = 1e-5) -> Any:
-    """Optimised Values.
+LARGE = 2000
+"""Variables from which nested dissection orders them better than minimum degree: measured on runs of ten minutes with an IMU, half the
+time."""
+NEAR = 1e-2
+"""A Gauss-Newton step that raises the error by less than this share, after others that lowered it, has converged: robust losses are not
+quadratic, and the last steps go to and fro."""
+
+
+def optimised(graph: Any, values: Any, iterations: int, tolerance: float = 1e-5) -> Any:
+    """Values that minimise a nonlinear graph: Gauss-Newton as long as it lowers the error, Levenberg-Marquardt where it does not.
+
+    Near the minimum a damped step costs three times as much (damping, retries) and is no better.
 
     Raises:
         InsufficientDataError: the graph does not determine its variables.
     """
+    try:
+        return with_big_stack(lambda: _optimised(graph, values, iterations, tolerance))
+    except RuntimeError as err:
+        raise InsufficientDataError(f"the data do not determine the path ({str(err).splitlines()[0]})") from err
+
+
+def ordering_of(graph: Any, variables: int) -> Any:
+    """In which the variables of a graph, linear or not, are eliminated."""
+    kind = gtsam.Ordering.OrderingType.METIS if variables > LARGE else gtsam.Ordering.OrderingType.COLAMD
+    linear = isinstance(graph, gtsam.GaussianFactorGraph)
+    create = gtsam.Ordering.CreateGaussianFactorGraph if linear else gtsam.Ordering.CreateNonlinearFactorGraph
+    return create(kind, graph)
+
+
+def _optimised(graph: Any, values: Any, iterations: int, tolerance: float) -> Any:
+    ordering = ordering_of(graph, values.size())
+    error = graph.error(values)
+    for k in range(iterations):
+        try:
+            moved = values.retract(graph.linearize(values).optimize(ordering))
+            now = graph.error(moved)
+        except RuntimeError:  # a variable that no factor holds here: damping may carry it to where one does
+            now, moved = math.inf, values
+        if not now <= error:  # NaN too
+            if k > 0 and now < (1.0 + NEAR) * error:
+                return values
+            return _levenberg_marquardt(graph, values, ordering, iterations - k, tolerance)
+        converged = error - now < tolerance * error
+        values, error = moved, now
+        if converged:
+            break
+    return values
+
+
+def _levenberg_marquardt(graph: Any, values: Any, ordering: Any, iterations: int, tolerance: float) -> Any:
     p = gtsam.LevenbergMarquardtParams()
     p.setRelativeErrorTol(tolerance)
     p.setMaxIterations(iterations)
-    p.setOrderingType("METIS" if values.size() > 5000 else "COLAMD")
-    try:
-        return with_big_stack(lambda: gtsam.LevenbergMarquardtOptimizer(graph, values, p).optimize())
-    except RuntimeError as err:
-        raise InsufficientDataError(f"the data do not determine the path ({str(err).splitlines()[0]})") from err
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, ordering, p).optimize()

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +19,12 @@ from topograph.localize.index import build_index
 from topograph.localize.method import Fix, Method, Report
 from topograph.localize.slip import SlipWatch
 from topograph.localize.submap import Move, Sweep
-from topograph.motion import Leg, Reckoner, twist_during, up_at
+from topograph.motion import Leg, Reckoner
 from topograph.topomap import TopoMap
-from topograph.trunks import none_at, smeared
+from topograph.trunks import none_at
+
+if TYPE_CHECKING:  # loading it takes a second, and recorded trunks do without
+    from topograph.trunks.frontend import FrontEnd
 
 HEADING_FLOOR = 0.004
 """Least deviation of a heading from trees for learning the gyro's bias, rad: its errors last over many scans."""
@@ -32,8 +36,6 @@ UNKNOWN_S = 1.0
 CLOCK_SET = 3
 """So many scans in a row that are older than the last one: it is the clock that was set back."""
 
-Detect = Callable[[Scan, Array, Array | None], Trunks]
-
 
 class Localizer:
     """Where the robot is in a map, from trunks and dead reckoning, without GNSS and from anywhere.
@@ -41,7 +43,7 @@ class Localizer:
     Args:
         topo: the map.
         config: settings; `config.risk` is the chance of a wrong pose that is accepted.
-        detect: scan, twist (6,) and vertical (2,) or None -> trunks in `base_link`; needed only when scans are fed.
+        front_end: scan -> trunks in `base_link`; needed only when scans are fed.
         child_T_robot: (4, 4), from odometry's child frame to `base_link`.
         robot_R_imu: (3, 3), the IMU's mounting; None: from gravity.
         method: another method than the default (`thesis.ThesisMethod`).
@@ -51,7 +53,7 @@ class Localizer:
     """
 
     def __init__(
-        self, topo: TopoMap, config: LocalizeConfig | None = None, *, detect: Detect | None = None,
+        self, topo: TopoMap, config: LocalizeConfig | None = None, *, front_end: FrontEnd | None = None,
         child_T_robot: Array | None = None, robot_R_imu: Array | None = None, method: Method | None = None,
     ) -> None:  # fmt: skip
         if len(topo) < 2:
@@ -60,10 +62,7 @@ class Localizer:
         self.method = method or GraphMethod(topo, self.config)
         self.reckoner = Reckoner(child_T_robot, robot_R_imu)
         self.report: Report | None = None
-        self._detect = detect
-        self._robot_R_imu = robot_R_imu
-        self._recent_odometry: list[Odometry] = []
-        self._recent_imu: list[Imu] = []
+        self._front_end = front_end
         self._heard_ns = 0
         self._old = 0
 
@@ -75,7 +74,8 @@ class Localizer:
         """
         for m in odometry:
             self.reckoner.add(m)
-            (self._recent_imu if isinstance(m, Imu) else self._recent_odometry).append(m)  # type: ignore[arg-type]  # each list takes its own kind
+            if self._front_end is not None:
+                self._front_end.hear(m)
             self._heard_ns = m.stamp_ns
         if scan.stamp_ns <= 0 and self._heard_ns > 0:
             scan = replace(scan, stamp_ns=self._heard_ns)  # a driver that does not stamp: the newest message's time
@@ -86,18 +86,7 @@ class Localizer:
             self.reckoner.restart(scan.stamp_ns)
         restarted, self._old = self._old >= CLOCK_SET, 0
         if isinstance(scan, Scan):
-            if self._detect is None:
-                raise TypeError("a Localizer that is fed scans needs `detect`")
-            timed = scan.offset is not None and bool(np.isfinite(scan.offset).any())
-            last = scan.stamp_ns + (int(np.nanmax(scan.offset) * 1e9) if timed and scan.offset is not None else 0)
-            twist, source = twist_during(
-                scan.stamp_ns, last, self._recent_odometry, self._recent_imu, self._robot_R_imu
-            )
-            up = up_at(scan.stamp_ns, self._recent_odometry, self._recent_imu, self._robot_R_imu)
-            scan = self._seen(scan, twist, up)
-            if not timed or source == "none":
-                scan = smeared(scan, twist, source != "none")
-        del self._recent_odometry[:-200], self._recent_imu[:-500]
+            scan = self._seen(scan)
         self.leg = self.reckoner.advance(scan.stamp_ns)
         if restarted:  # how long it took until the clock was set is not known
             self.leg = replace(self.leg, blind=UNKNOWN_S, gyro=False)
@@ -112,11 +101,12 @@ class Localizer:
             )
         return fix
 
-    def _seen(self, scan: Scan, twist: Array, up: Array | None) -> Trunks:
+    def _seen(self, scan: Scan) -> Trunks:
         """The trunks of a scan; one that breaks the front end shows nothing."""
-        assert self._detect is not None
+        if self._front_end is None:
+            raise TypeError("a Localizer that is fed scans needs a `front_end`")
         try:
-            return self._detect(scan, twist, up)
+            return self._front_end.see(scan)
         except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError) as err:
             log.warning("the scan of %.3f s broke the front end: %r", scan.stamp_ns * 1e-9, err)
             return none_at(scan.stamp_ns)

@@ -1,18 +1,18 @@
 """Odometry + Imu -> Motion: where dead reckoning says the robot is, at any stamp. No map, no trunks."""
 
-from topograph.motion.gravity import up_at
 from topograph.motion.inertial import Inertial, align_imu, mount_turn
 from topograph.motion.online import Leg, Reckoner
+from topograph.motion.recent import RecentMotion
 from topograph.motion.reckon import Motion, MotionConfig, dead_reckon
 from topograph.motion.samples import in_radians, without_nonsense
 from topograph.motion.streams import Streams, StreamsBuilder
-from topograph.motion.twist import twist_during
 
 __all__ = [
     "Inertial",
     "Leg",
     "Motion",
     "MotionConfig",
+    "RecentMotion",
     "Reckoner",
     "Streams",
     "StreamsBuilder",
@@ -20,7 +20,5 @@ __all__ = [
     "dead_reckon",
     "in_radians",
     "mount_turn",
-    "twist_during",
-    "up_at",
     "without_nonsense",
 ]

@@ -18,6 +18,7 @@ from topograph.motion import Motion, Streams, align_imu, dead_reckon, in_radians
 from topograph.pipeline.read import Progress, Run, silent
 from topograph.topomap import TopoMap, build, merge
 from topograph.trees import (
+    AtKeyframes,
     Detections,
     Existence,
     LoopCloser,
@@ -244,6 +245,7 @@ class _Association:
     def __init__(self, problem: Problem, track: NDArray[np.int64], config: Config) -> None:
         self.problem, self.config = problem, config
         self.track = track
+        self.seen = AtKeyframes.of(problem.detections, problem.stamps_ns, problem.motion)
         self.tracks = int(self.track.max(initial=-1)) + 1
         self.known = len(problem.known.p) if problem.known is not None else 0
         self.closer = LoopCloser(self.tracks + self.known, problem.motion.gyro, config.trees, config.motion)
@@ -325,8 +327,7 @@ class _Association:
         tree = name[tree]
         p = self.problem
         known = None if p.known is None else replace(p.known, tree=name[tree_of_track[self.tracks :]])
-        sightings = gather(p.detections, tree, p.stamps_ns, p.motion)
-        return replace(p, sightings=sightings, n_trees=len(ids), known=known), tree, ids
+        return replace(p, sightings=self.seen.gather(tree), n_trees=len(ids), known=known), tree, ids
 
 
 def _associate_and_solve(

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,8 +19,11 @@ from topograph.bags import DAMAGED, UNDECODED, Fix, Heading, Imu, Odometry, Reco
 from topograph.config import Config
 from topograph.errors import InputError
 from topograph.geometry import Array, inverse
-from topograph.motion import Streams, StreamsBuilder, twist_during, up_at
-from topograph.trunks import from_recorded, smeared
+from topograph.motion import Streams, StreamsBuilder
+from topograph.trunks import from_recorded
+
+if TYPE_CHECKING:
+    from topograph.trunks.frontend import FrontEnd
 
 log = logging.getLogger(__name__)
 
@@ -64,8 +68,7 @@ def stream(
 
     Only what was recorded within `span_s` (from, to) seconds of the recording's start is read.
     """
-    detect = _detector(recording, config)
-    builder = StreamsBuilder()
+    front_end = _front_end(recording, config)
     pending: list[tuple[int, Scan]] = []
     seen: set[int] = set()
     expected = max(1, sum(recording.counts[t] for t in recording.chosen.values()))
@@ -82,12 +85,14 @@ def stream(
         elif isinstance(product, Trunks):
             yield from_recorded(product, recording.frames.get(product.frame), config.trunks)
         else:
-            builder.add(product)
+            if isinstance(product, (Odometry, Imu)):
+                front_end.hear(product)
             yield product
         while pending and recording.log_ns > pending[0][0] + WAIT_NS:
-            yield from _careful(detect, pending.pop(0)[1], builder, recording.skipped)
+            yield from _careful(front_end, pending.pop(0)[1], recording.skipped)
     for _, scan in pending:
-        yield from _careful(detect, scan, builder, recording.skipped)
+        yield from _careful(front_end, scan, recording.skipped)
+    recording.untimed += front_end.untimed
     progress("read", 1.0)
 
 
@@ -108,12 +113,10 @@ def _window(recording: Recording, span_s: tuple[float, float]) -> tuple[int, int
     return recording.start_ns + start, recording.start_ns + stop
 
 
-def _careful(
-    detect: Callable[[Scan, StreamsBuilder], Trunks], scan: Scan, builder: StreamsBuilder, skipped: Counter[str]
-) -> Iterator[Trunks]:
+def _careful(front_end: FrontEnd, scan: Scan, skipped: Counter[str]) -> Iterator[Trunks]:
     """The trunks of one scan; one that breaks the front end is counted and does not end the run."""
     try:
-        yield detect(scan, builder)
+        yield front_end.see(scan)
     except (ArithmeticError, ValueError, IndexError, np.linalg.LinAlgError) as err:
         skipped[f"points: {BROKE}"] += 1
         log.warning("the scan of %.3f s broke the front end: %r", scan.stamp_ns * 1e-9, err)
@@ -268,8 +271,7 @@ def _detect_part(paths: Sequence[Path], config: Config, start_ns: int, stop_ns: 
     """The scans recorded from `start_ns` until before `stop_ns`."""
     out: list[Trunks] = []
     with Recording(paths, config.bags) as recording:
-        detect = _detector(recording, config)
-        builder = StreamsBuilder()
+        front_end = _front_end(recording, config)
         pending: list[tuple[int, Scan]] = []
         seen: set[int] = set()
         window = (max(start_ns - _LAG_NS, recording.start_ns), stop_ns + _LAG_NS)
@@ -284,14 +286,14 @@ def _detect_part(paths: Sequence[Path], config: Config, start_ns: int, stop_ns: 
                     else:
                         pending.append((recording.log_ns, product))
             elif isinstance(product, (Imu, Odometry)):
-                builder.add(product)
+                front_end.hear(product)
             while pending and recording.log_ns > pending[0][0] + WAIT_NS:
-                out += _careful(detect, pending.pop(0)[1], builder, recording.skipped)
+                out += _careful(front_end, pending.pop(0)[1], recording.skipped)
         for _, scan in pending:
-            out += _careful(detect, scan, builder, recording.skipped)
+            out += _careful(front_end, scan, recording.skipped)
         given = recording.given["points"]
         skipped = Counter({k: v for k, v in recording.skipped.items() if k.startswith("points")})
-        return _Part(out, skipped, given, recording.undecoded, recording.clocks.notes, recording.untimed)
+        return _Part(out, skipped, given, recording.undecoded, recording.clocks.notes, front_end.untimed)
 
 
 def child_mount(recording: Recording, child: str, config: Config, notes: list[str]) -> Array:
@@ -303,36 +305,11 @@ def child_mount(recording: Recording, child: str, config: Config, notes: list[st
     return inverse(base_T_child)
 
 
-def _detector(recording: Recording, config: Config) -> Callable[[Scan, StreamsBuilder], Trunks]:
-    """Scan -> trunks in the base's frame, deskewed with what the small streams said around the scan."""
-    from topograph.trunks.detector import Detector
-    from topograph.trunks.thesis import ThesisDetector
+def _front_end(recording: Recording, config: Config) -> FrontEnd:
+    """The front end with the mountings that the recording knows."""
+    from topograph.trunks.frontend import FrontEnd
 
-    detectors: dict[str, Detector | ThesisDetector] = {}
-
-    def detect(scan: Scan, streams: StreamsBuilder) -> Trunks:
-        if scan.frame not in detectors:
-            base_T_lidar = recording.frames.get(scan.frame)
-            if config.trunks.front_end == "thesis":
-                detectors[scan.frame] = ThesisDetector(base_T_lidar, config.thesis_trunks)
-            else:
-                detectors[scan.frame] = Detector(base_T_lidar, config.trunks)
-        robot_R_imu = None
-        if streams.imu:
-            mount = recording.frames.find(streams.imu[0].frame)
-            robot_R_imu = None if mount is None else mount[:3, :3]
-        if scan.offset is None:
-            recording.untimed += 1
-        first, last = scan.stamp_ns, scan.stamp_ns
-        if scan.offset is not None and len(scan.offset):
-            first += int(np.nanmin(scan.offset) * 1e9)
-            last += int(np.nanmax(scan.offset) * 1e9)
-        twist, source = twist_during(first, last, streams.odometry, streams.imu, robot_R_imu)
-        up = up_at(scan.stamp_ns, streams.odometry, streams.imu, robot_R_imu)
-        trunks = detectors[scan.frame](scan, twist, up)
-        return trunks if scan.offset is not None and source != "none" else smeared(trunks, twist, source != "none")
-
-    return detect
+    return FrontEnd(recording.frames.get, recording.frames.find, config.trunks, config.thesis_trunks)
 
 
 def scan_near(

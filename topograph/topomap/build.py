@@ -15,6 +15,7 @@ from topograph.topomap.edges import TopomapConfig, among
 from topograph.topomap.map import TREE, TopoMap, Viewpoint
 from topograph.topomap.rows import find_rows
 from topograph.trees import Detections, Existence, Shapes
+from topograph.trunks import LEAST_CLOUD
 
 
 def build(
@@ -74,36 +75,44 @@ def _viewpoints(
     foot: Array, tree: NDArray[np.int64], detections: Detections, trunks: Sequence[Trunks], map_T_scan: Array,
     config: TopomapConfig,
 ) -> tuple[Viewpoint, ...]:  # fmt: skip
-    clouds = [c for t in trunks for c in (t.clouds or [np.zeros((0, 3), np.float32)] * len(t))]
+    clouds = [c for t in trunks for c in (t.clouds or [_NO_CLOUD] * len(t))]
     if not any(map(len, clouds)):
         return ()
-    clouds = [clouds[k] for k in detections.source.tolist()]
-    size = np.array([len(c) for c in clouds])
+    source = detections.source
+    size = np.array([len(c) for c in clouds])[source]
+    shown = np.flatnonzero((tree >= 0) & (size >= LEAST_CLOUD))
+    shown = shown[np.lexsort((-size[shown], tree[shown]))]  # tree by tree, the fullest first
+    ends = np.searchsorted(tree[shown], np.arange(len(foot) + 1))
     out: list[Viewpoint] = []
     for j in range(len(foot)):
-        mine = np.flatnonzero((tree == j) & (size >= 8))
-        mine = mine[np.argsort(-size[mine], kind="stable")]
+        mine = shown[ends[j] : ends[j + 1]]
         v = map_T_scan[detections.scan[mine], :3, 3] - foot[j]  # eq. 4.13
         v[:, 2] = 0.0  # views differ by side, not by the slope between robot and tree
         v /= np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9)
-        centres: list[Array] = []
-        members: list[list[int]] = []
-        for i, d in zip(mine.tolist(), v, strict=True):
-            similar = [float(d @ c) for c in centres]
-            k = int(np.argmax(similar)) if similar else -1
-            if k >= 0 and similar[k] > config.viewpoint_cosine:
-                if len(members[k]) < config.clouds_per_viewpoint:
-                    members[k].append(i)
-            else:
-                centres.append(d)
-                members.append([i])
-        for c, group in zip(centres, members, strict=True):
+        for direction, rows in _sides(v, config.viewpoint_cosine):
             parts = []
-            for i in group:
+            for i in mine[rows[: config.clouds_per_viewpoint]].tolist():
                 T = map_T_scan[detections.scan[i]]
-                parts.append((clouds[i] @ T[:3, :3].T + T[:3, 3] - foot[j]).astype(np.float32))
-            out.append(Viewpoint(j, c, register(parts, config.voxel)))
+                parts.append((clouds[source[i]] @ T[:3, :3].T + T[:3, 3] - foot[j]).astype(np.float32))
+            out.append(Viewpoint(j, direction, register(parts, config.voxel)))
     return tuple(out)
+
+
+_NO_CLOUD = np.zeros((0, 3), np.float32)
+
+
+def _sides(v: Array, cosine: float) -> list[tuple[Array, NDArray[np.int64]]]:
+    """Unit vectors `v` (N, 3) in groups: the first that no earlier one is near (inner product above `cosine`) begins a group, and each
+    belongs to the nearest of those that began one.
+    """
+    centres: list[int] = []
+    alike = np.full((len(v), 0), -1.0)
+    while len(far := np.flatnonzero(alike.max(axis=1, initial=-1.0) <= cosine)):
+        centres.append(int(far[0]))
+        alike = np.column_stack([alike, v @ v[far[0]]])
+        alike[far[0], -1] = 2.0  # its own, whatever rounding says
+    group = alike.argmax(axis=1) if centres else np.zeros(0, np.int64)
+    return [(v[c], np.flatnonzero(group == k)) for k, c in enumerate(centres)]
 
 
 def _first_branch(n: int, viewpoints: Sequence[Viewpoint], axes: Array) -> Array:

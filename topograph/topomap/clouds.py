@@ -2,48 +2,55 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from topograph.geometry import Array
-from topograph.trunks.open3d_door import open3d
+
+REACH = 0.12
+"""Points further from each other are none of one spot of bark, m; a registration that moves a cloud by more is not believed."""
+ITERATIONS = 15
+MOST = 60
+"""Points of a cloud, at least, that say where it lies; more say the same."""
+LEAST = 12
+"""Points that fix where a cloud lies; small_gicp warns below that."""
 
 
-def register(clouds: list[NDArray[np.float32]], voxel: float, reach: float = 0.12) -> NDArray[np.float32]:
+def register(clouds: list[NDArray[np.float32]], voxel: float) -> NDArray[np.float32]:
     """One cloud (M, 3) of several of the same side of a tree: ICP of each onto those before, then thinned.
 
-    A registration that moves a cloud by more than `reach`, or matches less than half of it, is not believed; the
+    A registration that moves a cloud by more than `REACH`, or matches less than half of it, is not believed; the
     cloud then stays where the poses put it.
     """
-    o3d = open3d()
-    whole = clouds[0].astype(float)
-    for cloud in clouds[1:]:
-        source = _cloud(o3d, cloud)
-        result = o3d.pipelines.registration.registration_icp(
-            source, _cloud(o3d, whole), reach, np.eye(4),
-            o3d.pipelines.registration.TransformationEstimationPointToPoint(),
-            o3d.pipelines.registration.ICPConvergenceCriteria(max_iteration=15),
+    if len(clouds) == 1:
+        return thin(clouds[0].astype(float), voxel)
+    from small_gicp import KdTree, PointCloud, align
+
+    parts = [c.astype(float) for c in clouds]
+    whole = parts[0]
+    for cloud in parts[1:]:
+        if min(len(whole), len(cloud)) < LEAST:
+            whole = np.concatenate([whole, cloud])
+            continue
+        target, some = PointCloud(whole), cloud[:: max(len(cloud) // MOST, 1)]
+        r = align(
+            target, PointCloud(some), KdTree(target), registration_type="ICP",
+            max_correspondence_distance=REACH, max_iterations=ITERATIONS,
         )  # fmt: skip
-        T = np.asarray(result.transformation)
-        centre = cloud.astype(float).mean(0)
-        shift = float(np.linalg.norm(T[:3, :3] @ centre + T[:3, 3] - centre))
-        moved = cloud.astype(float)
-        if result.fitness > 0.5 and shift < reach:
-            moved = moved @ T[:3, :3].T + T[:3, 3]
-        whole = np.concatenate([whole, moved])
+        R, t = r.T_target_source[:3, :3], r.T_target_source[:3, 3]
+        centre = cloud.mean(0)
+        if r.num_inliers > 0.5 * len(some) and float(np.linalg.norm(R @ centre + t - centre)) < REACH:
+            cloud = cloud @ R.T + t
+        whole = np.concatenate([whole, cloud])
     return thin(whole, voxel)
-
-
-def _cloud(o3d: Any, points: Array | NDArray[np.float32]) -> Any:
-    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.asarray(points, float)))
 
 
 def thin(points: Array, voxel: float) -> NDArray[np.float32]:
     """The mean of the points in each voxel (M, 3)."""
     key = np.floor(points / voxel).astype(np.int64)
-    _, index, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    total = np.zeros((len(count), 3))
-    np.add.at(total, index.ravel(), points)
-    return (total / count[:, None]).astype(np.float32)
+    key -= key.min(axis=0)
+    key = (key[:, 0] << 42) + (key[:, 1] << 21) + key[:, 2]  # a tree is smaller than two million voxels
+    order = np.argsort(key)
+    first = np.flatnonzero(np.diff(key[order], prepend=-1))
+    total = np.add.reduceat(points[order], first)
+    return (total / np.diff(first, append=len(key))[:, None]).astype(np.float32)

@@ -7,16 +7,18 @@ from topograph.trees.loops import LoopCloser, TrackTable, moved_pose, tabulate
 from topograph.trees.refine import refine
 from topograph.trees.screen import screen
 from topograph.trees.shape import Shapes, relevelled, shapes
-from topograph.trees.sightings import Sightings, gather
-from topograph.trees.tracks import TreesConfig, follow
+from topograph.trees.sightings import AtKeyframes, Sightings, gather
+from topograph.trees.tracks import Tracker, TreesConfig, follow
 
 __all__ = [
+    "AtKeyframes",
     "Detections",
     "Existence",
     "LoopCloser",
     "Shapes",
     "Sightings",
     "TrackTable",
+    "Tracker",
     "TreesConfig",
     "choose_keyframes",
     "exists",

@@ -47,39 +47,63 @@ DELAY_NS = 50_000_000
 """Over which the change of a sighting with its scan's clock is taken."""
 
 
-def gather(
-    detections: Detections,
-    tree: NDArray[np.int64],
-    keyframes_ns: NDArray[np.int64],
-    motion: Motion,
-    *,
-    independent: float = 0.25,
-) -> Sightings:
-    """Sightings of the detections with `tree` (N,) >= 0.
+@dataclass(frozen=True, slots=True)
+class AtKeyframes:
+    """The detections as their keyframes have them: what does not depend on which tree they are of.
 
-    Detections of one tree at one keyframe are averaged by their information; since their errors are alike, only a
-    share `independent` of each further one counts.
+    Attributes:
+        keyframe: (N,) nearest in time.
+        p: (N, 3) in the keyframe's base frame, m; `information` (N, 3, 3), weighed by belief.
+        late: (N, 3) as of `Sightings`.
     """
-    keep = np.flatnonzero(tree >= 0)
-    keyframe_of_scan = nearest_keyframe(detections.stamps_ns, keyframes_ns)
-    odom_T_scan, odom_T_keyframe = motion.at(detections.stamps_ns), motion.at(keyframes_ns)
-    keyframe_T_scan = inverse(odom_T_keyframe[keyframe_of_scan]) @ odom_T_scan
-    T = keyframe_T_scan[detections.scan[keep]]
-    p = transform(T, detections.p[keep])
-    later = inverse(odom_T_keyframe[keyframe_of_scan]) @ motion.at(detections.stamps_ns + DELAY_NS)
-    moved = (transform(later[detections.scan[keep]], detections.p[keep]) - p) / (DELAY_NS * 1e-9)
-    R = T[:, :3, :3]
-    information = np.linalg.inv(R @ detections.cov[keep] @ np.swapaxes(R, 1, 2))
-    information *= detections.believed[keep, None, None]
-    keyframe = keyframe_of_scan[detections.scan[keep]]
-    label = keyframe * (int(tree.max(initial=0)) + 1) + tree[keep]
-    _, first, index, count = np.unique(label, return_index=True, return_inverse=True, return_counts=True)
-    m = len(first)
-    total, weighted = np.zeros((m, 3, 3)), np.zeros((m, 3))
-    np.add.at(total, index, information)
-    np.add.at(weighted, index, (information @ p[:, :, None])[..., 0])
-    mean = np.linalg.solve(total, weighted[..., None])[..., 0] if m else np.zeros((0, 3))
-    late = np.stack([np.bincount(index, moved[:, k], m) for k in range(3)], axis=1) / np.maximum(count, 1)[:, None]
-    effective = 1 + independent * (count - 1)
-    cov = np.linalg.inv(total) * (count / effective)[:, None, None] if m else np.zeros((0, 3, 3))
-    return Sightings(keyframe[first], tree[keep][first], np.asarray(mean, float), np.asarray(cov, float), count, late)
+
+    keyframe: NDArray[np.int64]
+    p: Array
+    information: Array
+    late: Array
+
+    @staticmethod
+    def of(detections: Detections, keyframes_ns: NDArray[np.int64], motion: Motion) -> AtKeyframes:
+        """Brought there by dead reckoning."""
+        scan = detections.scan
+        keyframe = nearest_keyframe(detections.stamps_ns, keyframes_ns)
+        keyframe_T_odom = inverse(motion.at(keyframes_ns)[keyframe])
+        T = (keyframe_T_odom @ motion.at(detections.stamps_ns))[scan]
+        p = transform(T, detections.p)
+        later = (keyframe_T_odom @ motion.at(detections.stamps_ns + DELAY_NS))[scan]
+        moved = (transform(later, detections.p) - p) / (DELAY_NS * 1e-9)
+        R = T[:, :3, :3]
+        information = np.linalg.inv(R @ detections.cov @ np.swapaxes(R, 1, 2)) * detections.believed[:, None, None]
+        return AtKeyframes(keyframe[scan], p, np.asarray(information, float), moved)
+
+    def gather(self, tree: NDArray[np.int64], *, independent: float = 0.25) -> Sightings:
+        """Sightings of the detections with `tree` (N,) >= 0.
+
+        Detections of one tree at one keyframe are averaged by their information; since their errors are alike, only a
+        share `independent` of each further one counts.
+        """
+        keep = np.flatnonzero(tree >= 0)
+        if not len(keep):
+            none = np.zeros(0, np.int64)
+            return Sightings(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)), none, np.zeros((0, 3)))
+        label = self.keyframe[keep] * (int(tree.max()) + 1) + tree[keep]
+        order = np.argsort(label, kind="stable")
+        first = np.flatnonzero(np.diff(label[order], prepend=-1))
+        rows = keep[order]
+        count = np.diff(first, append=len(rows))
+        information = self.information[rows]
+        total = np.add.reduceat(information, first)
+        weighted = np.add.reduceat((information @ self.p[rows][:, :, None])[..., 0], first)
+        cov = np.linalg.inv(total)
+        mean = (cov @ weighted[..., None])[..., 0]
+        effective = 1 + independent * (count - 1)
+        late = np.add.reduceat(self.late[rows], first) / count[:, None]
+        rows = rows[first]
+        return Sightings(self.keyframe[rows], tree[rows], mean, cov * (count / effective)[:, None, None], count, late)
+
+
+def gather(
+    detections: Detections, tree: NDArray[np.int64], keyframes_ns: NDArray[np.int64], motion: Motion
+) -> Sightings:
+    """Sightings of the detections with `tree` (N,) >= 0, see `AtKeyframes.gather`."""
+    return AtKeyframes.of(detections, keyframes_ns, motion).gather(tree)

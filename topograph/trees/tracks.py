@@ -11,6 +11,7 @@ from scipy.optimize import linear_sum_assignment
 from topograph.geometry import Array, transform
 from topograph.motion import Motion
 from topograph.trees.detections import Detections
+from topograph.trees.gating import gated, seen_again
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,69 +50,87 @@ class TreesConfig:
     min_share: float = 0.03
 
 
-def follow(detections: Detections, motion: Motion, config: TreesConfig) -> NDArray[np.int64]:
-    """Track (N,) of each detection, by gated optimal assignment in the odometry frame.
+class Tracker:
+    """Follows trunks from scan to scan in the odometry frame, by gated optimal assignment; fed forwards, live and in batch.
 
-    A track's place follows the newest sightings, so that it drifts with dead reckoning and not against it.
+    A track's place follows the newest sightings, so that it drifts with dead reckoning and not against it. Tracks are named in the
+    order of their birth; what has not been seen for `config.forget` m is forgotten.
     """
-    odom_T_robot = motion.at(detections.stamps_ns)
-    distance = motion.distance_at(detections.stamps_ns)
-    p = transform(odom_T_robot[detections.scan], detections.p)[:, :2] if len(detections) else np.zeros((0, 2))
-    cov = _planar_cov(detections, odom_T_robot)
-    track = np.full(len(detections), -1, np.int64)
-    ends = np.searchsorted(detections.scan, np.arange(len(detections.stamps_ns) + 1))
-    ids: NDArray[np.int64] = np.zeros(0, np.int64)
-    place, spread = np.zeros((0, 2)), np.zeros((0, 2, 2))
-    seen, hits = np.zeros(0), np.zeros(0)
-    born = 0
-    for s in range(len(detections.stamps_ns)):
-        here = slice(ends[s], ends[s + 1])
-        n = ends[s + 1] - ends[s]
-        keep = distance[s] - seen < config.forget
-        ids, place, spread, seen, hits = ids[keep], place[keep], spread[keep], seen[keep], hits[keep]
+
+    def __init__(self, config: TreesConfig) -> None:
+        self.config = config
+        self.born = 0
+        self._ids: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._place, self._spread = np.zeros((0, 2)), np.zeros((0, 2, 2))
+        self._seen, self._hits = np.zeros(0), np.zeros(0)
+
+    def step(self, p: Array, cov: Array, distance: float) -> NDArray[np.int64]:
+        """Track (N,) of each trunk of one scan at `p` (N, 2) with `cov` (N, 2, 2), after `distance` m driven."""
+        c = self.config
+        keep = distance - self._seen < c.forget
+        if not keep.all():
+            self._ids, self._place, self._spread = self._ids[keep], self._place[keep], self._spread[keep]
+            self._seen, self._hits = self._seen[keep], self._hits[keep]
+        n = len(p)
         if n == 0:
-            continue
-        match = _match(p[here], cov[here], place, spread, distance[s] - seen, config)
-        for i, j in match:
-            k = ends[s] + i
-            gain = max(1.0 / (hits[j] + 1), 0.1)
-            place[j] += gain * (p[k] - place[j])
-            spread[j] = (1 - gain) * spread[j] + gain * gain * cov[k]
-            seen[j] = distance[s]
-            hits[j] += 1
-            track[k] = ids[j]
-        new = np.flatnonzero(track[here] < 0) + ends[s]
-        track[new] = born + np.arange(len(new))
-        born += len(new)
-        ids = np.concatenate([ids, track[new]])
-        place, spread = np.concatenate([place, p[new]]), np.concatenate([spread, cov[new]])
-        seen, hits = (
-            np.concatenate([seen, np.full(len(new), distance[s])]),
-            np.concatenate([hits, np.ones(len(new))]),
-        )
-    return track
+            return np.zeros(0, np.int64)
+        pairs, cost = gated(p, cov, self._place, self._spread, distance - self._seen, c.floor, c.drift, c.gate)
+        match = assigned(pairs, cost, n, len(self._ids))
+        seen_again(p, cov, match, self._place, self._spread, self._hits)
+        old, new = np.flatnonzero(match >= 0), np.flatnonzero(match < 0)
+        self._seen[match[old]] = distance
+        track = np.empty(n, np.int64)
+        track[old] = self._ids[match[old]]
+        track[new] = self.born + np.arange(len(new))
+        self.born += len(new)
+        self._ids = np.concatenate([self._ids, track[new]])
+        self._place, self._spread = np.concatenate([self._place, p[new]]), np.concatenate([self._spread, cov[new]])
+        self._seen = np.concatenate([self._seen, np.full(len(new), distance)])
+        self._hits = np.concatenate([self._hits, np.ones(len(new))])
+        return track
+
+
+def assigned(pairs: NDArray[np.int64], cost: Array, rows: int, columns: int) -> NDArray[np.int64]:
+    """Column (rows,) of each row, or -1: the cheapest assignment of as many as possible of the `pairs` (K, 2) with their `cost` (K,).
+
+    Where a row and a column have nobody else, they are each other's; only the rest is a problem.
+    """
+    match = np.full(rows, -1, np.int64)
+    i, j = pairs[:, 0], pairs[:, 1]
+    alone = (np.bincount(i, minlength=rows)[i] == 1) & (np.bincount(j, minlength=columns)[j] == 1)
+    match[i[alone]] = j[alone]
+    if alone.all():
+        return match
+    i, j, cost = i[~alone], j[~alone], cost[~alone]
+    r, a = np.unique(i, return_inverse=True)
+    c, b = np.unique(j, return_inverse=True)
+    table = np.full((len(r), len(c)), FAR)
+    table[a, b] = cost
+    a, b = linear_sum_assignment(table)
+    near = table[a, b] < 0.1 * FAR
+    match[r[a[near]]] = c[b[near]]
+    return match
+
+
+FAR = 1e6
+"""Cost of a pair that is none."""
+
+
+def follow(detections: Detections, motion: Motion, config: TreesConfig) -> NDArray[np.int64]:
+    """Track (N,) of each detection, in the order of the scans."""
+    if not len(detections):
+        return np.zeros(0, np.int64)
+    odom_T_robot = motion.at(detections.stamps_ns)
+    distance = motion.distance_at(detections.stamps_ns).tolist()
+    p = np.ascontiguousarray(transform(odom_T_robot[detections.scan], detections.p)[:, :2])
+    cov = _planar_cov(detections, odom_T_robot)
+    ends = np.searchsorted(detections.scan, np.arange(len(detections.stamps_ns) + 1)).tolist()
+    tracker = Tracker(config)
+    return np.concatenate(
+        [tracker.step(p[a:b], cov[a:b], d) for a, b, d in zip(ends[:-1], ends[1:], distance, strict=True)]
+    )
 
 
 def _planar_cov(detections: Detections, odom_T_robot: Array) -> Array:
-    if not len(detections):
-        return np.zeros((0, 2, 2))
     R = odom_T_robot[detections.scan, :3, :3]
-    return np.asarray((R @ detections.cov @ np.swapaxes(R, 1, 2))[:, :2, :2])
-
-
-def _match(
-    p: Array, cov: Array, place: Array, spread: Array, since: Array, config: TreesConfig
-) -> list[tuple[int, int]]:
-    if len(place) == 0:
-        return []
-    d = p[:, None] - place[None]
-    slack = config.floor**2 + (config.drift * since) ** 2
-    S = cov[:, None] + spread[None] + slack[None, :, None, None] * np.eye(2)
-    det = S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] ** 2
-    m2 = (
-        d[..., 0] ** 2 * S[..., 1, 1] - 2 * d[..., 0] * d[..., 1] * S[..., 0, 1] + d[..., 1] ** 2 * S[..., 0, 0]
-    ) / np.maximum(det, 1e-12)
-    cost = np.minimum(m2 + np.log(np.maximum(det, 1e-12)), 1e3)
-    cost[m2 > config.gate] = 1e6
-    rows, columns = linear_sum_assignment(cost)
-    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if cost[i, j] < 1e5]
+    return np.ascontiguousarray((R @ detections.cov @ np.swapaxes(R, 1, 2))[:, :2, :2])

@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+LEAST_CLOUD = 8
+"""Points of a trunk below which they show no side of it."""
+
 
 @dataclass(frozen=True, slots=True)
 class TrunksConfig:

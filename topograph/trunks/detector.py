@@ -13,7 +13,7 @@ from topograph.bags import Scan, Trunks
 from topograph.geometry import Array
 from topograph.trunks import fit as fitting
 from topograph.trunks import score as scoring
-from topograph.trunks.config import TrunksConfig
+from topograph.trunks.config import LEAST_CLOUD, TrunksConfig
 from topograph.trunks.features import FEATURES, describe
 from topograph.trunks.fit import OUT_SIZE, covariances, fit_chains, gather, members, merge_stems, suppress, vertical
 from topograph.trunks.ground import fit_ground
@@ -160,13 +160,21 @@ class Detector:
             cov=covariances(merged, scoring.error_scales(c.features[keep][best], self.network)),
             height=merged[:, fitting.ABOVE],
             score=scoring.tree_odds(kinds[best]),
-            clouds=tuple(c.points[rows[a:b]] for a, b in pairwise(ends.tolist())),
+            clouds=_clouds(c.points[rows], ends),
             kinds=kinds[best],
             measured=merged[:, [fitting.LEVER, fitting.SLOPE_X, fitting.SLOPE_Y, fitting.SLOPE_WEIGHT, fitting.WIDE, fitting.WIDE_SIGMA]],
             stems=merged[:, fitting.STEMS].astype(np.int64),
             free=c.free,
             eye=self.base_T_lidar[:3, 3],
         )  # fmt: skip
+
+
+_NO_CLOUD = np.zeros((0, 3), np.float32)
+
+
+def _clouds(points: NDArray[np.float32], ends: NDArray[np.int64]) -> tuple[NDArray[np.float32], ...]:
+    """The points (M, 3) of each trunk, of which `ends` (N + 1,) are the borders; none where there are too few."""
+    return tuple(points[a:b] if b - a >= LEAST_CLOUD else _NO_CLOUD for a, b in pairwise(ends.tolist()))
 
 
 @lru_cache(maxsize=1)

@@ -1,0 +1,82 @@
+"""The one door from a scan to its trunks, live and in replay: how the robot moved during the sweep, which way was up, one of the rivals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from topograph.bags import Imu, Odometry, Scan, Trunks
+from topograph.geometry import Array
+from topograph.motion import RecentMotion
+from topograph.trunks.config import TrunksConfig
+from topograph.trunks.detector import Detector
+from topograph.trunks.smear import smeared
+from topograph.trunks.thesis import ThesisDetector, ThesisTrunksConfig
+
+
+class Detect(Protocol):
+    """A rival: the trunks of a scan in `base_link` at its stamp."""
+
+    def __call__(self, scan: Scan, twist: Array, up: Array | None = None) -> Trunks:
+        """`twist` (6,) of the base during the sweep, m/s and rad/s; `up` (2,) the vertical in its frame, or None."""
+
+
+RIVALS: dict[str, Callable[[Array, TrunksConfig, ThesisTrunksConfig], Detect]] = {
+    "organised": lambda base_T_lidar, ours, _: Detector(base_T_lidar, ours),
+    "thesis": lambda base_T_lidar, _, thesis: ThesisDetector(base_T_lidar, thesis),
+}
+"""The front ends by the name that `TrunksConfig.front_end` gives them."""
+
+
+class FrontEnd:
+    """Scan -> trunks, with what `hear` was told of the robot's motion.
+
+    Args:
+        mount: frame of a LiDAR -> base_T_lidar (4, 4), or an error; asked once a frame.
+        find: frame of an IMU -> its mounting (4, 4) or None.
+
+    Attributes:
+        untimed: sweeps whose points had no time.
+    """
+
+    def __init__(
+        self,
+        mount: Callable[[str], Array],
+        find: Callable[[str], Array | None],
+        config: TrunksConfig | None = None,
+        thesis: ThesisTrunksConfig | None = None,
+    ) -> None:
+        self.config, self.thesis = config or TrunksConfig(), thesis or ThesisTrunksConfig()
+        self.untimed = 0
+        self._mount, self._find = mount, find
+        self._motion = RecentMotion()
+        self._imu_frame: str | None = None
+        self._detect: dict[str, Detect] = {}
+
+    def hear(self, message: Odometry | Imu) -> None:
+        """One message of wheels or IMU."""
+        if isinstance(message, Imu) and message.frame != self._imu_frame:
+            self._imu_frame = message.frame
+            found = self._find(message.frame)
+            self._motion.robot_R_imu = None if found is None else found[:3, :3]
+        self._motion.add(message)
+
+    def see(self, scan: Scan) -> Trunks:
+        """The trunks of one scan in `base_link`, deskewed to its stamp.
+
+        Where no point has a time, or nothing is known of the motion, the stated covariance is the wider for it.
+        """
+        if scan.frame not in self._detect:
+            self._detect[scan.frame] = RIVALS[self.config.front_end](self._mount(scan.frame), self.config, self.thesis)
+        first = last = scan.stamp_ns
+        timed = scan.offset is not None and bool(np.isfinite(scan.offset).any())
+        if timed and scan.offset is not None:  # the sweep may lie before its stamp, after it, or around it
+            first += int(np.nanmin(scan.offset) * 1e9)
+            last += int(np.nanmax(scan.offset) * 1e9)
+        else:
+            self.untimed += 1
+        twist, source = self._motion.twist(first, last)
+        trunks = self._detect[scan.frame](scan, twist, self._motion.up(scan.stamp_ns))
+        return trunks if timed and source != "none" else smeared(trunks, twist, source != "none")

@@ -353,9 +353,10 @@ def _associate_and_solve(
     estimate = a.solve(estimate, patient=True)
     for n, patience in enumerate((4.0, 2.0, 1.0)):
         progress("refine", n / 3)
-        t = a.table(estimate)
-        a.tree_of_track = refine(t, a.tree_of_track, config.trees, patience)
-        estimate = a.solve(estimate, patient=True)
+        before = a.tree_of_track
+        a.tree_of_track = refine(a.table(estimate), before, config.trees, patience)
+        if not np.array_equal(a.tree_of_track, np.unique(before, return_inverse=True)[1]):
+            estimate = a.solve(estimate, patient=True)
     progress("solve", 0.0)
     after = a.decide(estimate)
     for n in range(LAST_ROUNDS):

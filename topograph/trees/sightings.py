@@ -47,6 +47,10 @@ DELAY_NS = 50_000_000
 """Over which the change of a sighting with its scan's clock is taken."""
 
 
+BLOCK = 50_000
+"""Detections that are moved at once: their poses alone are larger than they are."""
+
+
 @dataclass(frozen=True, slots=True)
 class AtKeyframes:
     """The detections as their keyframes have them: what does not depend on which tree they are of.
@@ -65,16 +69,21 @@ class AtKeyframes:
     @staticmethod
     def of(detections: Detections, keyframes_ns: NDArray[np.int64], motion: Motion) -> AtKeyframes:
         """Brought there by dead reckoning."""
-        scan = detections.scan
         keyframe = nearest_keyframe(detections.stamps_ns, keyframes_ns)
         keyframe_T_odom = inverse(motion.at(keyframes_ns)[keyframe])
-        T = (keyframe_T_odom @ motion.at(detections.stamps_ns))[scan]
-        p = transform(T, detections.p)
-        later = (keyframe_T_odom @ motion.at(detections.stamps_ns + DELAY_NS))[scan]
-        moved = (transform(later, detections.p) - p) / (DELAY_NS * 1e-9)
-        R = T[:, :3, :3]
-        information = np.linalg.inv(R @ detections.cov @ np.swapaxes(R, 1, 2)) * detections.believed[:, None, None]
-        return AtKeyframes(keyframe[scan], p, np.asarray(information, float), moved)
+        now = keyframe_T_odom @ motion.at(detections.stamps_ns)
+        later = keyframe_T_odom @ motion.at(detections.stamps_ns + DELAY_NS)
+        n, believed = len(detections), detections.believed
+        p, moved, information = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3, 3))
+        for at in range(0, n, BLOCK):
+            rows = slice(at, at + BLOCK)
+            T, then = now[detections.scan[rows]], later[detections.scan[rows]]
+            p[rows] = transform(T, detections.p[rows])
+            moved[rows] = (transform(then, detections.p[rows]) - p[rows]) / (DELAY_NS * 1e-9)
+            R = T[:, :3, :3]
+            information[rows] = np.linalg.inv(R @ detections.cov[rows] @ np.swapaxes(R, 1, 2))
+            information[rows] *= believed[rows, None, None]
+        return AtKeyframes(keyframe[detections.scan], p, information, moved)
 
     def gather(self, tree: NDArray[np.int64], *, independent: float = 0.25) -> Sightings:
         """Sightings of the detections with `tree` (N,) >= 0.

@@ -7,6 +7,8 @@ from typing import Literal
 
 LEAST_CLOUD = 8
 """Points of a trunk below which they show no side of it."""
+MOST_CLOUD = 120
+"""Points of one sight of a trunk that are kept: ten sights make a viewpoint, and a run holds hundreds of thousands."""
 
 
 @dataclass(frozen=True, slots=True)

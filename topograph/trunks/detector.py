@@ -13,7 +13,7 @@ from topograph.bags import Scan, Trunks
 from topograph.geometry import Array
 from topograph.trunks import fit as fitting
 from topograph.trunks import score as scoring
-from topograph.trunks.config import LEAST_CLOUD, TrunksConfig
+from topograph.trunks.config import LEAST_CLOUD, MOST_CLOUD, TrunksConfig
 from topograph.trunks.features import FEATURES, describe
 from topograph.trunks.fit import OUT_SIZE, covariances, fit_chains, gather, members, merge_stems, suppress, vertical
 from topograph.trunks.ground import fit_ground
@@ -173,8 +173,11 @@ _NO_CLOUD = np.zeros((0, 3), np.float32)
 
 
 def _clouds(points: NDArray[np.float32], ends: NDArray[np.int64]) -> tuple[NDArray[np.float32], ...]:
-    """The points (M, 3) of each trunk, of which `ends` (N + 1,) are the borders; none where there are too few."""
-    return tuple(points[a:b] if b - a >= LEAST_CLOUD else _NO_CLOUD for a, b in pairwise(ends.tolist()))
+    """Of the points (M, 3) of each trunk, whose borders are `ends` (N + 1,), at most about `MOST_CLOUD`; none where there are too few."""
+    return tuple(
+        points[a : b : max((b - a) // MOST_CLOUD, 1)].copy() if b - a >= LEAST_CLOUD else _NO_CLOUD
+        for a, b in pairwise(ends.tolist())
+    )
 
 
 @lru_cache(maxsize=1)

@@ -12,8 +12,6 @@ from topograph.bags import Fix, Heading, Imu, Odometry
 from topograph.geometry import Array, Datum, interpolate, planar, to_quaternion, transform, wrap, yaw_of
 from topograph.motion import (
     MotionConfig,
-    Streams,
-    StreamsBuilder,
     align_imu,
     dead_reckon,
     in_radians,
@@ -21,6 +19,7 @@ from topograph.motion import (
     without_nonsense,
 )
 from topograph.motion.rates import compare, wheel_rate
+from topograph.session import Streams, StreamsBuilder
 
 T0 = 1_700_000_000 * 10**9
 DATUM = Datum(40.0, -8.0, 100.0)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from topograph.errors import MapError
 from topograph.geometry import Array, Datum, from_quaternion, to_quaternion
-from topograph.topomap import KINDS, TopoMap, Viewpoint
+from topograph.topomap import KINDS, Seen, SessionRecord, TopoMap, Viewpoint
 
 SCHEMA_VERSION = 2
 _WGS84 = (
@@ -39,13 +39,18 @@ CREATE TABLE gpkg_geometry_columns (table_name TEXT NOT NULL, column_name TEXT N
   CONSTRAINT pk_geom_cols PRIMARY KEY (table_name, column_name));
 CREATE TABLE trees (id INTEGER PRIMARY KEY NOT NULL, geom BLOB, x REAL, y REAL, z REAL, cov_xx REAL, cov_xy REAL,
   cov_yy REAL, cov_zz REAL, axis_x REAL, axis_y REAL, axis_z REAL, diameter REAL, first_branch REAL,
-  sightings INTEGER, score REAL, "row" INTEGER, kind TEXT NOT NULL, kind_probability REAL, stems INTEGER NOT NULL);
+  sightings INTEGER, score REAL, "row" INTEGER, kind TEXT NOT NULL, kind_probability REAL, stems INTEGER NOT NULL,
+  state TEXT NOT NULL, block INTEGER NOT NULL, place TEXT NOT NULL);
 CREATE TABLE edges (id INTEGER PRIMARY KEY NOT NULL, a INTEGER NOT NULL, b INTEGER NOT NULL, length REAL, geom BLOB);
 CREATE TABLE path (id INTEGER PRIMARY KEY NOT NULL, stamp_ns INTEGER NOT NULL, x REAL, y REAL, z REAL,
-  qx REAL, qy REAL, qz REAL, qw REAL, geom BLOB);
+  qx REAL, qy REAL, qz REAL, qw REAL, geom BLOB, session INTEGER NOT NULL);
 CREATE TABLE viewpoints (id INTEGER PRIMARY KEY NOT NULL, tree INTEGER NOT NULL, vx REAL, vy REAL, vz REAL,
-  points INTEGER, cloud BLOB, crc INTEGER);
+  points INTEGER, cloud BLOB, crc INTEGER, session INTEGER NOT NULL);
 CREATE INDEX viewpoints_by_tree ON viewpoints (tree);
+CREATE TABLE sessions (id INTEGER PRIMARY KEY NOT NULL, name TEXT NOT NULL, start_ns INTEGER NOT NULL, end_ns INTEGER NOT NULL,
+  distance REAL, inputs TEXT NOT NULL, verdict TEXT NOT NULL);
+CREATE TABLE sightings (id INTEGER PRIMARY KEY NOT NULL, tree INTEGER NOT NULL, session INTEGER NOT NULL, count INTEGER NOT NULL,
+  first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, passed INTEGER NOT NULL);
 CREATE TABLE meta (key TEXT PRIMARY KEY NOT NULL, value TEXT);
 """
 
@@ -103,19 +108,20 @@ def _fill(c: sqlite3.Connection, t: TopoMap) -> None:
             (name, "features", name, *(None if b is None else float(b) for b in box), srs),
         )
         c.execute("INSERT INTO gpkg_geometry_columns VALUES (?,?,?,?,?,?)", (name, "geom", kind, srs, 1, 0))
-    for name in ("viewpoints", "meta"):
+    for name in ("viewpoints", "sessions", "sightings", "meta"):
         c.execute(
             "INSERT INTO gpkg_contents (table_name, data_type, identifier) VALUES (?,?,?)",
             (name, "attributes", name),
         )
+    state, block, place = t.state, t.block, t.place
     c.executemany(
-        f"INSERT INTO trees VALUES ({','.join(20 * '?')})",
+        f"INSERT INTO trees VALUES ({','.join(23 * '?')})",
         [
             (
                 int(t.ids[i]), _geometry(world[i : i + 1], srs), *_real(t.p[i]),
                 *_real([t.cov[i, 0, 0], t.cov[i, 0, 1], t.cov[i, 1, 1], t.cov[i, 2, 2]]), *_real(t.axis[i]),
                 *_real([t.diameter[i], t.first_branch[i]]), int(t.sightings[i]), *_real([t.score[i]]), int(t.row[i]),
-                KINDS[int(t.kind[i])], *_real([t.kind_probability[i]]), int(t.stems[i]),
+                KINDS[int(t.kind[i])], *_real([t.kind_probability[i]]), int(t.stems[i]), state[i], int(block[i]), place[i],
             )
             for i in range(len(t))
         ],
@@ -129,7 +135,7 @@ def _fill(c: sqlite3.Connection, t: TopoMap) -> None:
     )
     q = to_quaternion(t.map_T_robot) if len(track) else np.zeros((0, 4))
     c.executemany(
-        "INSERT INTO path VALUES (?,?,?,?,?,?,?,?,?,?)",
+        "INSERT INTO path VALUES (?,?,?,?,?,?,?,?,?,?,?)",
         [
             (
                 k + 1,
@@ -137,6 +143,7 @@ def _fill(c: sqlite3.Connection, t: TopoMap) -> None:
                 *_real(track[k]),
                 *_real(q[k]),
                 _geometry(world_track[k : k + 1], srs),
+                1 + (int(t.session[k]) if len(t.session) else 0),
             )
             for k in range(len(track))
         ],
@@ -144,8 +151,30 @@ def _fill(c: sqlite3.Connection, t: TopoMap) -> None:
     rows = []
     for k, v in enumerate(t.viewpoints):
         blob = np.clip(np.round(v.cloud * 1000.0), -32768, 32767).astype("<i2").tobytes()
-        rows.append((k + 1, int(t.ids[v.tree]), *_real(v.direction), len(v.cloud), blob, zlib.crc32(blob)))
-    c.executemany("INSERT INTO viewpoints VALUES (?,?,?,?,?,?,?,?)", rows)
+        rows.append(
+            (k + 1, int(t.ids[v.tree]), *_real(v.direction), len(v.cloud), blob, zlib.crc32(blob), v.session + 1)
+        )
+    c.executemany("INSERT INTO viewpoints VALUES (?,?,?,?,?,?,?,?,?)", rows)
+    c.executemany(
+        "INSERT INTO sessions VALUES (?,?,?,?,?,?,?)",
+        [
+            (k + 1, s.name, s.start_ns, s.end_ns, *_real([s.distance]), s.inputs, s.verdict)
+            for k, s in enumerate(t.sessions)
+        ],
+    )
+    seen = t.seen
+    c.executemany(
+        "INSERT INTO sightings VALUES (?,?,?,?,?,?,?)",
+        [
+            (
+                k + 1,
+                int(t.ids[seen.tree[k]]),
+                int(seen.session[k]) + 1,
+                *(int(v[k]) for v in (seen.count, seen.first_ns, seen.last_ns, seen.passed)),
+            )
+            for k in range(len(seen))
+        ],
+    )
     meta = {
         **t.meta,
         "schema_version": str(SCHEMA_VERSION),
@@ -202,17 +231,24 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
         c.close()
 
 
-_DIGESTED = ("trees", "edges", "path", "viewpoints", "meta")
+_DIGESTED = ("trees", "edges", "path", "viewpoints", "sessions", "sightings", "meta")
 
 
 def _digest(c: sqlite3.Connection, table: str) -> str:
     """SHA-256 over the rows of a table; of `meta` without the digests themselves."""
     where = " WHERE key NOT LIKE 'digest:%' ORDER BY key" if table == "meta" else " ORDER BY id"
-    columns = "id, tree, vx, vy, vz, points, crc" if table == "viewpoints" else "*"  # clouds have a CRC each
+    columns = "*"
+    if table == "viewpoints":  # clouds have a CRC each
+        columns = "id, tree, vx, vy, vz, points, crc" + (", session" if _has(c, table, "session") else "")
     h = hashlib.sha256()
     for row in c.execute(f"SELECT {columns} FROM {table}{where}"):  # the names are those above
         h.update(repr(row).encode())
     return h.hexdigest()
+
+
+def _has(c: sqlite3.Connection, table: str, column: str) -> bool:
+    """Whether a table has a column: maps of older programs lack some."""
+    return any(r[1] == column for r in c.execute(f"PRAGMA table_info({table})"))
 
 
 def _check_digests(c: sqlite3.Connection, path: Path) -> None:
@@ -309,7 +345,12 @@ def load(path: Path | str, *, clouds: bool = True, check: bool = True) -> TopoMa
             c.execute("SELECT x, y, z, qx, qy, qz, qw FROM path ORDER BY id").fetchall(), float
         ).reshape(-1, 7)
         stamps = np.array([r[0] for r in c.execute("SELECT stamp_ns FROM path ORDER BY id")], np.int64)
-        views = tuple(_viewpoint(path, place, r) for r in c.execute(_VIEWS)) if clouds else ()
+        told = _has(c, "viewpoints", "session")
+        views: tuple[Viewpoint, ...] = ()
+        if clouds:
+            views = tuple(_viewpoint(path, place, r) for r in c.execute(_VIEWS.format("session" if told else "1")))
+        sightings = v[:, 13].astype(np.int64)
+        sessions, session, seen = _sessions(c, place, stamps, sightings)
         datum = Datum(*(float(x) for x in meta["datum"].split(","))) if meta.get("datum") else None
         edges = edges.reshape(-1, 2)
         p = v[:, 1:4]
@@ -323,7 +364,7 @@ def load(path: Path | str, *, clouds: bool = True, check: bool = True) -> TopoMa
             axis=v[:, 8:11],
             diameter=v[:, 11],
             first_branch=v[:, 12],
-            sightings=v[:, 13].astype(np.int64),
+            sightings=sightings,
             score=v[:, 14],
             row=v[:, 15].astype(np.int64),
             kind=kind,
@@ -336,11 +377,54 @@ def load(path: Path | str, *, clouds: bool = True, check: bool = True) -> TopoMa
             map_T_robot=from_quaternion(path_rows[:, :3], path_rows[:, 3:]) if len(stamps) else np.zeros((0, 4, 4)),
             datum_cov=np.array([float(x) for x in meta.get("datum_cov", "0 " * 9).split()]).reshape(3, 3),
             meta={k: x for k, x in meta.items() if k not in _OWN and not k.startswith("digest:")},
+            sessions=sessions,
+            session=session,
+            seen=seen,
         )
 
 
+def _sessions(
+    c: sqlite3.Connection, place: dict[int, int], stamps: NDArray[np.int64], sightings: NDArray[np.int64]
+) -> tuple[tuple[SessionRecord, ...], NDArray[np.int64], Seen]:
+    """The sessions of a map, the one of each of its poses, and what they saw; a map that was written before they were kept has one."""
+    if not _has(c, "sessions", "name"):
+        n, k = len(sightings), len(stamps)
+        zero = np.zeros(n, np.int64)
+        if not n and not k:
+            return (), zero, Seen.none()
+        first, last = (int(stamps[0]), int(stamps[-1])) if k else (0, 0)
+        record = SessionRecord(name="before sessions were kept", start_ns=first, end_ns=last)
+        seen = Seen(
+            tree=np.arange(n), session=zero, count=sightings, first_ns=zero + first, last_ns=zero + last, passed=zero
+        )
+        return (record,), np.zeros(k, np.int64), seen
+    records = tuple(
+        SessionRecord(
+            name=r[0], start_ns=r[1], end_ns=r[2], distance=np.nan if r[3] is None else r[3], inputs=r[4], verdict=r[5]
+        )
+        for r in c.execute("SELECT name, start_ns, end_ns, distance, inputs, verdict FROM sessions ORDER BY id")
+    )
+    session = np.array([r[0] for r in c.execute("SELECT session FROM path ORDER BY id")], np.int64) - 1
+    rows = np.array(
+        [
+            (place[r[0]], *r[1:])
+            for r in c.execute("SELECT tree, session, count, first_ns, last_ns, passed FROM sightings ORDER BY id")
+        ],
+        np.int64,
+    ).reshape(-1, 6)
+    seen = Seen(
+        tree=rows[:, 0],
+        session=rows[:, 1] - 1,
+        count=rows[:, 2],
+        first_ns=rows[:, 3],
+        last_ns=rows[:, 4],
+        passed=rows[:, 5],
+    )
+    return records, session, seen
+
+
 _OWN = ("schema_version", "datum", "georeferenced", "datum_cov")
-_VIEWS = "SELECT tree, vx, vy, vz, points, cloud, crc FROM viewpoints"
+_VIEWS = "SELECT tree, vx, vy, vz, points, cloud, crc, {} FROM viewpoints"
 
 
 def clouds_near(path: Path, xy: Array, radius: float) -> list[tuple[int, Array, NDArray[np.float32]]]:
@@ -348,7 +432,7 @@ def clouds_near(path: Path, xy: Array, radius: float) -> list[tuple[int, Array, 
     with _opened(path) as c:
         x, y = float(xy[0]), float(xy[1])
         found = c.execute(
-            "SELECT v.tree, vx, vy, vz, points, cloud, crc FROM viewpoints v JOIN trees t ON t.id = v.tree "
+            "SELECT v.tree, vx, vy, vz, points, cloud, crc, 1 FROM viewpoints v JOIN trees t ON t.id = v.tree "
             "WHERE t.x BETWEEN ? AND ? AND t.y BETWEEN ? AND ? AND (t.x-?)*(t.x-?)+(t.y-?)*(t.y-?) <= ?",
             (x - radius, x + radius, y - radius, y + radius, x, x, y, y, radius**2),
         ).fetchall()
@@ -356,12 +440,15 @@ def clouds_near(path: Path, xy: Array, radius: float) -> list[tuple[int, Array, 
     return [(tree, v.direction, v.cloud) for tree, v in views]
 
 
-def _viewpoint(path: Path, place: dict[int, int], r: tuple[int, float, float, float, int, bytes, int]) -> Viewpoint:
-    tree, vx, vy, vz, points, blob, crc = r
+def _viewpoint(
+    path: Path, place: dict[int, int], r: tuple[int, float, float, float, int, bytes, int, int]
+) -> Viewpoint:
+    tree, vx, vy, vz, points, blob, crc, session = r
     if zlib.crc32(blob) != crc or len(blob) != 6 * points:
         raise MapError(f"{path}: the cloud of tree {tree} is damaged; map the bags again or restore a copy")
     return Viewpoint(
         place[tree],
         np.array([vx, vy, vz]),
         (np.frombuffer(blob, "<i2").reshape(-1, 3) * 0.001).astype(np.float32),
+        session - 1,
     )

@@ -12,7 +12,8 @@ from topograph.audit.verdict import Finding
 from topograph.estimate import Estimate, Problem
 from topograph.estimate.initial import heading_misfit
 from topograph.geometry import Array, inverse, transform, yaw_of
-from topograph.motion import Motion, Streams
+from topograph.motion import Motion
+from topograph.session import Streams
 
 SURE = 25.0
 """Gain of a score test from which it is no chance: five standard deviations of one parameter."""

@@ -12,7 +12,8 @@ from scipy.spatial import cKDTree
 from topograph.estimate.initial import heading_misfit, initial_path, moves_enough
 from topograph.estimate.problem import EstimateConfig, Fixes, Headings, Problem
 from topograph.geometry import Array, Datum, Stamps, inverse, transform
-from topograph.motion import Inertial, Motion, MotionConfig, Streams
+from topograph.motion import Inertial, Motion, MotionConfig
+from topograph.session import Streams
 from topograph.trees import Detections, Sightings
 from topograph.trees.sightings import DELAY_NS, nearest_keyframe
 

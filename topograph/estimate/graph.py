@@ -139,7 +139,7 @@ def _values(problem: Problem, poses: Array, trees: Array, inert: Inertia | None)
     values = gtsam.Values()
     for k, T in enumerate(factors.to_pose3s(orthonormal(poses))):
         values.insert(X + k, T)
-    for j, p in enumerate(trees):
+    for j, p in zip(problem.names().tolist(), trees, strict=False):
         values.insert(L + j, p)
     if inert is not None:
         seconds = problem.stamps_ns * 1e-9
@@ -203,22 +203,22 @@ def _headings(problem: Problem, config: EstimateConfig) -> Iterator[Any]:
 
 def _trunks(problem: Problem, p: Pass) -> Iterator[Any]:
     s = problem.sightings
-    keys = (X + s.keyframe).tolist(), (L + s.tree).tolist()
+    keys = (X + s.keyframe).tolist(), (L + problem.names()[s.tree]).tolist()
     yield from factors.trunks(*keys, s.p, p.trunk_scale**2 * s.cov, p.trunk)
 
 
 def _tree_priors(problem: Problem) -> Iterator[Any]:
     """Keep every tree in the system even when a loss has given up on all its sightings."""
     wide = factors.sigmas([100.0] * 3)
-    s = problem.sightings
+    s, names = problem.sightings, problem.names()
     if problem.known is not None:
         k = problem.known
         for i in np.flatnonzero(k.tree >= 0).tolist():
-            yield gtsam.PriorFactorPoint3(L + int(k.tree[i]), k.p[i], factors.gaussian(k.cov[i]))
+            yield gtsam.PriorFactorPoint3(L + int(names[k.tree[i]]), k.p[i], factors.gaussian(k.cov[i]))
     first = np.unique(s.tree, return_index=True)[1]
     T = problem.start if problem.start is not None else problem.odom_T_robot
     for i in first.tolist():
-        yield gtsam.PriorFactorPoint3(L + int(s.tree[i]), transform(T[s.keyframe[i]], s.p[i]), wide)
+        yield gtsam.PriorFactorPoint3(L + int(names[s.tree[i]]), transform(T[s.keyframe[i]], s.p[i]), wide)
 
 
 def _motion(problem: Problem, inert: Inertia | None) -> Iterator[tuple[str, Any]]:
@@ -302,7 +302,7 @@ def _path(problem: Problem, values: Any) -> Array:
 
 
 def _trees(problem: Problem, values: Any) -> Array:
-    return np.array([values.atPoint3(L + j) for j in range(problem.n_trees)]).reshape(-1, 3)
+    return np.array([values.atPoint3(L + j) for j in problem.names().tolist()]).reshape(-1, 3)
 
 
 def _trunk_residuals(problem: Problem, values: Any, scale: float) -> Array:
@@ -354,7 +354,7 @@ def _polish(problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | 
     ordering = None
     rest = graph_of(problem, p, config, inert, without=("trunk",))
     s = problem.sightings
-    keys_x, keys_l = (X + s.keyframe).tolist(), (L + s.tree).tolist()
+    keys_x, keys_l = (X + s.keyframe).tolist(), (L + problem.names()[s.tree]).tolist()
     cov = p.trunk_scale**2 * s.cov
     linear = None
     for _ in range(8):
@@ -394,7 +394,7 @@ def _tested(
         mount[:, 0, 1] = mount[:, 1, 2] = -1.0
         mount[:, 0, 3], mount[:, 1, 3] = s.p[:, 1], -s.p[:, 0]
         factors.trunk_linear(
-            g, (X + s.keyframe).tolist(), (L + s.tree).tolist(), path[s.keyframe], trees[s.tree], s.p,
+            g, (X + s.keyframe).tolist(), (L + problem.names()[s.tree]).tolist(), path[s.keyframe], trees[s.tree], s.p,
             p.trunk_scale**2 * s.cov, p.trunk, (C + 1, mount),
         )  # fmt: skip
     if len(f.keyframe):
@@ -437,7 +437,7 @@ def _estimate(problem: Problem, config: EstimateConfig, values: Any, p: Pass, li
     joint = None
     tree_cov = np.full((problem.n_trees, 3, 3), np.nan)
     if linear is not None and problem.n_trees:
-        keys = [L + j for j in range(problem.n_trees)]
+        keys = [L + j for j in problem.names().tolist()]
         joint, tree_cov = with_big_stack(lambda: covariance.of_trees(linear, keys))
         tree_cov = tree_cov + datum_cov + config.tree_floor**2 * np.diag([1.0, 1.0, 1.0])
     e = _trunk_residuals(problem, values, p.trunk_scale)

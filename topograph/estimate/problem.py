@@ -110,6 +110,8 @@ class Problem:
         detections: all trunks, for the estimator that associates for itself.
         sightings: associated trunks.
         n_trees: number of trees in `sightings`.
+        tree_ids: (n_trees,) what each is called from pass to pass: the first of its tracks, or the known tree that it is. The graph's
+            keys are made of it.
         pose_sigma: when the path is known beforehand (`start`), its deviation (m, rad); else None.
         start: (K, 4, 4) first guess of `map_T_robot`, or None.
         known: trees that an earlier map knows, or None.
@@ -136,6 +138,11 @@ class Problem:
     up: Array | None = None
     up_sigma: Array | None = None
     link: Link | None = None
+    tree_ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def names(self) -> NDArray[np.int64]:
+        """`tree_ids`; where nobody gave any, trees are called by their number."""
+        return self.tree_ids if len(self.tree_ids) == self.n_trees else np.arange(self.n_trees)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,7 +5,6 @@ from topograph.motion.online import Leg, Reckoner
 from topograph.motion.recent import RecentMotion
 from topograph.motion.reckon import Motion, MotionConfig, dead_reckon
 from topograph.motion.samples import in_radians, without_nonsense
-from topograph.motion.streams import Streams, StreamsBuilder
 
 __all__ = [
     "Inertial",
@@ -14,8 +13,6 @@ __all__ = [
     "MotionConfig",
     "RecentMotion",
     "Reckoner",
-    "Streams",
-    "StreamsBuilder",
     "align_imu",
     "dead_reckon",
     "in_radians",

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from topograph.geometry import Array, Stamps, se3, yaw_of
 from topograph.motion.rates import ALIKE, Agreement, compare, outside_rate, wheel_rate
-from topograph.motion.streams import Streams
+from topograph.session import Streams
 
 GRAVITY = 9.80665
 

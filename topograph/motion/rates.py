@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from topograph.geometry import Array, Stamps, wrap, yaw_of
-from topograph.motion.streams import Streams
 from topograph.motion.wheels import GOOD_FIX
+from topograph.session import Streams
 
 STEP_S = 0.1
 """Between the moments that are compared."""

@@ -21,8 +21,8 @@ from topograph.geometry import (
     yaw_of,
 )
 from topograph.motion.inertial import GRAVITY, Inertial
-from topograph.motion.streams import Streams
 from topograph.motion.wheels import against_fixes
+from topograph.session import Streams
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from scipy.ndimage import median_filter
 
 from topograph.geometry import Array
 from topograph.motion.rates import wheel_rate
-from topograph.motion.streams import Streams
+from topograph.session import Streams
 
 RANGE = (35.0, 160.0)
 """Full scale of MEMS sensors: 2000 °/s and 16 g, rad/s and m/s²."""

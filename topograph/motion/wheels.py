@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_opening
 
 from topograph.geometry import Array, Stamps, interpolate, transform
-from topograph.motion.streams import Streams
+from topograph.session import Streams
 
 GOOD_FIX = 0.15
 """Horizontal sigma up to which fixes tell of a slip, m."""

@@ -13,13 +13,12 @@ from topograph.pipeline.mapping import (
     topo_map,
     why_no_trees,
 )
-from topograph.pipeline.read import Run, read_run, scan_near
+from topograph.pipeline.read import read_run, scan_near
 
 __all__ = [
     "Inspection",
     "Replay",
     "Role",
-    "Run",
     "Solved",
     "audited",
     "baseline",

@@ -14,8 +14,9 @@ from topograph.bags import Recording, Scan, StreamSurvey, Survey, Trunks, survey
 from topograph.config import Config
 from topograph.errors import FrameError, InputError
 from topograph.geometry import Array
-from topograph.motion import Streams, StreamsBuilder, align_imu
+from topograph.motion import align_imu
 from topograph.pipeline.read import refuse_damaged
+from topograph.session import Streams, StreamsBuilder
 
 GAP = {"points": 1.0, "trunks": 2.0, "odometry": 0.5, "imu": 0.2, "fix": 10.0, "heading": 30.0}
 """Silences that are worth a word, s: trunks of the map, wheels and gyro are bridged for less."""

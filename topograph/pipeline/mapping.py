@@ -14,9 +14,10 @@ from topograph.estimate import Estimate, KnownTrees, Link, Problem, average, gra
 from topograph.estimate.assemble import assemble, choose_datum, without_wrong_headings
 from topograph.evaluate import Metric, fix_metrics
 from topograph.geometry import Array, inverse, transform
-from topograph.motion import Motion, Streams, align_imu, dead_reckon, in_radians, without_nonsense
-from topograph.pipeline.read import Progress, Run, silent
-from topograph.topomap import TopoMap, build, merge
+from topograph.motion import Motion, align_imu, dead_reckon, in_radians, without_nonsense
+from topograph.pipeline.read import Progress, silent
+from topograph.session import Session, Streams
+from topograph.topomap import SessionRecord, TopoMap, build, merge
 from topograph.trees import (
     AtKeyframes,
     Detections,
@@ -33,6 +34,7 @@ from topograph.trees import (
     refine,
     relevelled,
     screen,
+    seen_through,
     shapes,
     tabulate,
 )
@@ -53,7 +55,7 @@ class Solved:
         loops: loops closed.
     """
 
-    run: Run
+    run: Session
     streams: Streams
     motion: Motion
     detections: Detections
@@ -70,7 +72,7 @@ class Solved:
 
 
 def solve_run(
-    run: Run,
+    run: Session,
     config: Config,
     *,
     check_fixes: int = 0,
@@ -287,11 +289,23 @@ class _Association:
         self.problem = replace(self.problem, start=e.map_T_robot)
         return graph.solve(self.problem, self.config.estimate, quick=True, patient=patient)
 
+    def named(self, tree: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The trees of the tracks, called by the first of their tracks, or by the known tree that they are: a name lasts from pass to
+        pass, whatever joins it later.
+        """
+        index = np.unique(tree, return_inverse=True)[1]
+        order = np.roll(
+            np.arange(len(tree)), self.known
+        )  # known trees come last among the tracks, and first among the names
+        first = np.full(int(index.max(initial=-1)) + 1, len(tree))
+        np.minimum.at(first, index, order)
+        return np.asarray(np.argsort(order)[first[index]])
+
     def decide(self, e: Estimate) -> _Decided:
         """What there is, given an estimate."""
         c, d = self.config.trees, self.problem.detections
         t = self.table(e)
-        self.tree_of_track = refine(t, self.tree_of_track, c)
+        self.tree_of_track = self.named(refine(t, self.tree_of_track, c))
         map_T_scan = self.poses(e)
         _, tree, ids = self.with_trees(self.tree_of_track, 1)
         seen = transform(map_T_scan[d.scan], d.p)
@@ -327,7 +341,7 @@ class _Association:
         tree = name[tree]
         p = self.problem
         known = None if p.known is None else replace(p.known, tree=name[tree_of_track[self.tracks :]])
-        return replace(p, sightings=self.seen.gather(tree), n_trees=len(ids), known=known), tree, ids
+        return replace(p, sightings=self.seen.gather(tree), n_trees=len(ids), tree_ids=ids, known=known), tree, ids
 
 
 def _associate_and_solve(
@@ -349,13 +363,13 @@ def _associate_and_solve(
         a.tree_of_track = a.closer.tree
         estimate = a.solve(estimate, link=_link(problem, estimate, a.closer))
     progress("associate", 1.0)
-    a.tree_of_track = a.closer.tree
+    a.tree_of_track = a.named(a.closer.tree)
     estimate = a.solve(estimate, patient=True)
     for n, patience in enumerate((4.0, 2.0, 1.0)):
         progress("refine", n / 3)
         before = a.tree_of_track
-        a.tree_of_track = refine(a.table(estimate), before, config.trees, patience)
-        if not np.array_equal(a.tree_of_track, np.unique(before, return_inverse=True)[1]):
+        a.tree_of_track = a.named(refine(a.table(estimate), before, config.trees, patience))
+        if not np.array_equal(a.tree_of_track, before):
             estimate = a.solve(estimate, patient=True)
     progress("solve", 0.0)
     after = a.decide(estimate)
@@ -430,6 +444,20 @@ def topo_map(solved: Solved, config: Config, meta: dict[str, str]) -> TopoMap:
         solved.problem.datum,
         config.topomap,
         meta,
+        _record(solved, meta),
+    )
+
+
+def _record(solved: Solved, meta: dict[str, str]) -> SessionRecord:
+    """The run as a session of a map."""
+    stamps = solved.estimate.stamps_ns
+    return SessionRecord(
+        name=solved.run.id,
+        start_ns=int(stamps[0]),
+        end_ns=int(stamps[-1]),
+        distance=float(solved.motion.distance[-1]),
+        inputs=meta.get("inputs", "[]"),
+        verdict=meta.get("verdict", ""),
     )
 
 
@@ -496,4 +524,5 @@ def extend(old: TopoMap, new: TopoMap, solved: Solved, config: Config) -> TopoMa
     """The old map with a further run in it: trees seen again are updated, the others kept, new ones added."""
     known = solved.problem.known
     assert known is not None
-    return merge(old, new, known.tree, config.topomap)
+    passed = seen_through(solved.detections, map_T_scans(solved), known.p)
+    return merge(old, new, known.tree, config.topomap, passed)

@@ -19,7 +19,7 @@ from topograph.bags import DAMAGED, UNDECODED, Fix, Heading, Imu, Odometry, Reco
 from topograph.config import Config
 from topograph.errors import InputError
 from topograph.geometry import Array, inverse
-from topograph.motion import Streams, StreamsBuilder
+from topograph.session import Session, Streams, StreamsBuilder
 from topograph.trunks import from_recorded
 
 if TYPE_CHECKING:
@@ -33,32 +33,6 @@ WHOLE = (0.0, float("inf"))
 
 def silent(stage: str, share: float) -> None:
     """No progress shown."""
-
-
-@dataclass(frozen=True, slots=True)
-class Run:
-    """What was read of a recording.
-
-    Attributes:
-        streams: the small streams.
-        trunks: trunks of each scan in `base_link`, in time order.
-        mounts: "imu", "fix", "heading" -> robot_T_sensor, or None where no transform is known.
-        chosen: stream kind -> topic.
-        skipped: reason -> count.
-        notes: what had to be assumed.
-        scans, seconds, duration_s: counted, spent reading and detecting, recorded.
-    """
-
-    streams: Streams
-    trunks: list[Trunks]
-    mounts: dict[str, Array | None]
-    child_T_robot: Array
-    chosen: dict[str, str]
-    skipped: Counter[str]
-    notes: list[str]
-    scans: int
-    seconds: float
-    duration_s: float
 
 
 def stream(
@@ -128,7 +102,7 @@ def read_run(
     progress: Progress = silent,
     span_s: tuple[float, float] = WHOLE,
     jobs: int = 1,
-) -> Run:
+) -> Session:
     """Read a run (or `span_s` of it) once: small streams into arrays, scans into trunks as they come.
 
     With several `jobs`, each process detects in its part of the recording; the result is the same, bit for bit.
@@ -169,18 +143,19 @@ def read_run(
             notes.append(_smear(streams, trunks))
         child_T_robot = child_mount(recording, streams.frames.get("child", ""), config, notes)
         skipped = recording.skipped
-        chosen, duration = dict(recording.chosen), recording.duration_s
-    return Run(
-        streams,
-        trunks,
-        mounts,
-        child_T_robot,
-        chosen,
-        skipped,
-        notes,
-        len(trunks),
-        time.perf_counter() - began,
-        duration,
+        chosen, duration, start_ns = dict(recording.chosen), recording.duration_s, recording.start_ns
+    return Session(
+        streams=streams,
+        trunks=trunks,
+        mounts=mounts,
+        child_T_robot=child_T_robot,
+        chosen=chosen,
+        skipped=skipped,
+        notes=notes,
+        scans=len(trunks),
+        seconds=time.perf_counter() - began,
+        duration_s=duration,
+        start_ns=start_ns,
     )
 
 

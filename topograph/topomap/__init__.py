@@ -5,5 +5,17 @@ from topograph.topomap.edges import TopomapConfig, neighbours
 from topograph.topomap.map import KINDS, TopoMap, Viewpoint
 from topograph.topomap.merge import merge
 from topograph.topomap.rows import find_rows
+from topograph.topomap.sessions import Seen, SessionRecord
 
-__all__ = ["KINDS", "TopoMap", "TopomapConfig", "Viewpoint", "build", "find_rows", "merge", "neighbours"]
+__all__ = [
+    "KINDS",
+    "Seen",
+    "SessionRecord",
+    "TopoMap",
+    "TopomapConfig",
+    "Viewpoint",
+    "build",
+    "find_rows",
+    "merge",
+    "neighbours",
+]

@@ -14,6 +14,7 @@ from topograph.topomap.clouds import register
 from topograph.topomap.edges import TopomapConfig, among
 from topograph.topomap.map import TREE, TopoMap, Viewpoint
 from topograph.topomap.rows import find_rows
+from topograph.topomap.sessions import Seen, SessionRecord
 from topograph.trees import Detections, Existence, Shapes
 from topograph.trunks import LEAST_CLOUD
 
@@ -28,6 +29,7 @@ def build(
     datum: Datum | None,
     config: TopomapConfig,
     meta: dict[str, str],
+    session: SessionRecord | None = None,
 ) -> TopoMap:
     """The map of an estimate, whose trees have shapes `s`. `trunks` are the scans' trunks with their clouds;
     `detections.source` counts in them.
@@ -63,6 +65,27 @@ def build(
         map_T_robot=estimate.map_T_robot,
         datum_cov=estimate.datum_cov,
         meta=meta,
+        sessions=() if session is None else (session,),
+        session=np.zeros(len(estimate.stamps_ns), np.int64),
+        seen=Seen.none() if session is None else _seen(n, tree, detections, existence.passed),
+    )
+
+
+def _seen(n: int, tree: NDArray[np.int64], detections: Detections, passed: NDArray[np.int64]) -> Seen:
+    """Each of `n` trees in the map's one session."""
+    used = tree >= 0
+    ns = detections.stamps_ns[detections.scan[used]]
+    first, last = np.full(n, np.iinfo(np.int64).max), np.zeros(n, np.int64)
+    np.minimum.at(first, tree[used], ns)
+    np.maximum.at(last, tree[used], ns)
+    count = np.bincount(tree[used], minlength=n)
+    return Seen(
+        tree=np.arange(n),
+        session=np.zeros(n, np.int64),
+        count=count,
+        first_ns=np.where(count > 0, first, 0),
+        last_ns=last,
+        passed=passed,
     )
 
 

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from topograph.geometry import Array, Datum, Stamps
+from topograph.topomap.addresses import blocks_of, places_of
+from topograph.topomap.sessions import Seen, SessionRecord
 from topograph.trunks.score import KINDS, OTHER, TREE
 
 __all__ = ["KINDS", "OTHER", "TREE", "TopoMap", "Viewpoint"]
@@ -17,12 +19,13 @@ __all__ = ["KINDS", "OTHER", "TREE", "TopoMap", "Viewpoint"]
 class Viewpoint:
     """What node `tree` (row of the map's arrays) looks like from `direction` (3,), unit, node to robot, map frame.
 
-    `cloud` (M, 3) float32 is about the node's position, in the map's axes, m.
+    `cloud` (M, 3) float32 is about the node's position, in the map's axes, m. `session` is a row of the map's sessions.
     """
 
     tree: int
     direction: Array
     cloud: NDArray[np.float32]
+    session: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,6 +42,7 @@ class TopoMap:
         viewpoints: clouds by viewpoint.
         stamps_ns, map_T_robot: (K,), (K, 4, 4).
         datum_cov: (3, 3) covariance of the ENU transform, m²; contained in `cov`.
+        sessions: the runs that it was made of; `session` (K,) of each pose; `seen`: which tree was seen in which.
         meta: further facts as text: configuration, input hashes, versions.
     """
 
@@ -62,6 +66,9 @@ class TopoMap:
     map_T_robot: Array
     datum_cov: Array
     meta: dict[str, str] = field(default_factory=dict)
+    sessions: tuple[SessionRecord, ...] = ()
+    session: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    seen: Seen = field(default_factory=Seen.none)
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -98,6 +105,21 @@ class TopoMap:
         """(T,) landmarks that are trees."""
         return np.asarray(self.kind == TREE)
 
+    @property
+    def state(self) -> list[str]:
+        """State of each landmark, "standing" or "missing": what the last session says that looked for it."""
+        return self.seen.states(len(self))
+
+    @property
+    def block(self) -> NDArray[np.int64]:
+        """(T,) block of each tree, from 1: what edges join; 0 for what is no tree."""
+        return blocks_of(len(self), self.edges, self.is_tree)
+
+    @property
+    def place(self) -> list[str]:
+        """Address of each tree: block, row, and number along the row."""
+        return places_of(self.p[:, :2], self.block, self.row, self.is_tree)
+
     def trees(self) -> TopoMap:
         """The map without its landmarks that are no trees; itself where there are none."""
         keep = self.is_tree
@@ -119,7 +141,10 @@ class TopoMap:
             "stems",
         )
         views = tuple(replace(v, tree=int(row[v.tree])) for v in self.viewpoints if keep[v.tree])
-        return replace(self, edges=row[self.edges], viewpoints=views, **{k: getattr(self, k)[keep] for k in per_row})
+        seen = self.seen.moved(np.where(keep, row, -1), 0)
+        return replace(
+            self, edges=row[self.edges], viewpoints=views, seen=seen, **{k: getattr(self, k)[keep] for k in per_row}
+        )
 
     def geodetic(self) -> Array:
         """(T, 3) latitude, longitude (degrees) and height (m) of the nodes; NaN when not georeferenced."""

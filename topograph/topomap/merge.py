@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
 
 import numpy as np
@@ -11,10 +12,18 @@ from topograph.geometry import Array
 from topograph.topomap.edges import TopomapConfig, among
 from topograph.topomap.map import OTHER, TREE, TopoMap, Viewpoint
 from topograph.topomap.rows import find_rows
+from topograph.topomap.sessions import Seen
 
 
-def merge(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64], config: TopomapConfig) -> TopoMap:
-    """`tree_of_old` (T_old,) is the row in `new` that each old tree was seen as, or -1.
+def merge(
+    old: TopoMap,
+    new: TopoMap,
+    tree_of_old: NDArray[np.int64],
+    config: TopomapConfig,
+    passed: NDArray[np.int64] | None = None,
+) -> TopoMap:
+    """`tree_of_old` (T_old,) is the row in `new` that each old tree was seen as, or -1; `passed` (T_old,) scans of the new run that saw
+    through the places of old trees.
 
     The new run was solved with the old trees as priors, so its values for them are the joint ones. Ids of old trees
     stay; sightings add up; of two viewpoints from the same side the fuller one is kept.
@@ -39,7 +48,7 @@ def merge(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64], config: To
     for i, v in enumerate(views):
         of_tree[v.tree].append(i)
     for v in new.viewpoints:
-        moved = Viewpoint(int(row_of_new[v.tree]), v.direction, v.cloud)
+        moved = Viewpoint(int(row_of_new[v.tree]), v.direction, v.cloud, v.session + len(old.sessions))
         mine = of_tree[moved.tree]
         twin = [i for i in mine if float(views[i].direction @ v.direction) > config.viewpoint_cosine]
         if not twin:
@@ -79,8 +88,39 @@ def merge(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64], config: To
         stamps_ns=stamps,
         map_T_robot=poses,
         datum_cov=old.datum_cov,
-        meta=new.meta,
+        meta=new.meta | {"inputs": _inputs(old, new)},
+        sessions=(*old.sessions, *new.sessions),
+        session=np.concatenate([_of_poses(old), _of_poses(new) + len(old.sessions)]),
+        seen=_seen(old, new, row_of_new, np.flatnonzero(~seen), passed),
     )
+
+
+def _of_poses(topo: TopoMap) -> NDArray[np.int64]:
+    """Session (K,) of each pose; maps of older programs had none."""
+    return topo.session if len(topo.session) == len(topo.stamps_ns) else np.zeros(len(topo.stamps_ns), np.int64)
+
+
+def _inputs(old: TopoMap, new: TopoMap) -> str:
+    """All files that either was made of, as JSON."""
+    return json.dumps([i for t in (old, new) for i in json.loads(t.meta.get("inputs", "[]") or "[]")])
+
+
+def _seen(
+    old: TopoMap,
+    new: TopoMap,
+    row_of_new: NDArray[np.int64],
+    unseen: NDArray[np.int64],
+    passed: NDArray[np.int64] | None,
+) -> Seen:
+    """What both maps' sessions saw, and which old trees the new session looked for and did not see, rows `unseen`."""
+    out = old.seen.and_(new.seen.moved(row_of_new, len(old.sessions)))
+    if passed is None or not new.sessions:
+        return out
+    unseen = unseen[passed[unseen] > 0]
+    none = np.zeros(len(unseen), np.int64)
+    session = np.full(len(unseen), len(old.sessions))
+    missed = Seen(tree=unseen, session=session, count=none, first_ns=none, last_ns=none, passed=passed[unseen])
+    return out.and_(missed)
 
 
 def _surer(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64], cov: Array) -> Array:

@@ -1,7 +1,7 @@
 """Trunks + a predicted path -> which trunks are one tree: tracking, loop closing, births and deaths."""
 
 from topograph.trees.detections import Detections, in_order
-from topograph.trees.existence import Existence, exists
+from topograph.trees.existence import Existence, exists, seen_through
 from topograph.trees.keyframes import choose_keyframes
 from topograph.trees.loops import LoopCloser, TrackTable, moved_pose, tabulate
 from topograph.trees.refine import refine
@@ -29,6 +29,7 @@ __all__ = [
     "refine",
     "relevelled",
     "screen",
+    "seen_through",
     "shapes",
     "tabulate",
 ]

@@ -97,6 +97,15 @@ def exists(
     return Existence(ok=ok & (kind != OTHER), kind=kind, probability=probability, score=score, hits=hits, passed=passed)
 
 
+def seen_through(detections: Detections, map_T_scan: Array, places: Array) -> NDArray[np.int64]:
+    """Scans (T,) that saw through each of `places` (T, 3) at trunk height; zeros where scans do not tell what they passed."""
+    if not len(detections.free):
+        return np.zeros(len(places), np.int64)
+    scan, which = _pairs(detections, map_T_scan, places)
+    through = _through(detections, scan, _seen_from(map_T_scan, scan, places, which))
+    return np.bincount(which[through], minlength=len(places))
+
+
 def _weight(d: Detections, rows: NDArray[np.bool_]) -> Array:
     """How much of what a thing is each sighting tells, at `rows` (N,)."""
     return np.asarray(1.0 / (1.0 + np.sum(d.p[rows, :2] ** 2, axis=1) / NEAR**2))

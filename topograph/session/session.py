@@ -1,0 +1,56 @@
+"""A run that was read."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+import numpy as np
+
+from topograph.bags import Trunks
+from topograph.geometry import Array
+from topograph.session.streams import Streams
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Session:
+    """What was read of a recording.
+
+    Attributes:
+        streams: the small streams.
+        trunks: trunks of each scan in `base_link`, in time order.
+        mounts: "imu", "fix", "heading" -> robot_T_sensor, or None where no transform is known.
+        chosen: stream kind -> topic.
+        skipped: reason -> count.
+        notes: what had to be assumed.
+        scans, seconds, duration_s: counted, spent reading and detecting, recorded.
+        start_ns: when the recording began.
+    """
+
+    streams: Streams
+    trunks: list[Trunks]
+    mounts: dict[str, Array | None]
+    child_T_robot: Array
+    chosen: dict[str, str]
+    skipped: Counter[str]
+    notes: list[str]
+    scans: int
+    seconds: float
+    duration_s: float
+    start_ns: int
+
+    @property
+    def id(self) -> str:
+        """What the run is called: when it began, and six digits of what it holds. The same recording is always called the same, whatever
+        its files are."""
+        h = hashlib.sha256()
+        s = self.streams
+        for column in (s.odometry_ns, s.odom_T_child, s.imu_ns, s.gyro, s.fix_ns, s.lat_lon_h, s.heading_ns, s.heading):
+            h.update(column.tobytes())
+        for t in self.trunks:
+            h.update(t.stamp_ns.to_bytes(8, "big", signed=True))
+            h.update(np.ascontiguousarray(t.p).tobytes())
+        began = datetime.fromtimestamp(self.start_ns * 1e-9, UTC)
+        return f"{began:%Y%m%dT%H%M%S}Z-{h.hexdigest()[:6]}"

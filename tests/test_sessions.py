@@ -135,5 +135,7 @@ def test_a_record_says_what_it_was_made_of(two_sessions: tuple[TopoMap, TopoMap]
     one, _ = two_sessions
     record = one.sessions[0]
     assert isinstance(record, SessionRecord)
-    assert record.distance == pytest.approx(np.linalg.norm(np.diff(one.map_T_robot[:, :2, 3], axis=0), axis=1).sum(), rel=0.03)
+    assert record.distance == pytest.approx(
+        np.linalg.norm(np.diff(one.map_T_robot[:, :2, 3], axis=0), axis=1).sum(), rel=0.03
+    )
     assert replace(record, name="x").name == "x"

@@ -88,7 +88,12 @@ def map_command(
         inputs = stack.enter_context(hashed(bags))
         with progress_bar(quiet) as progress:
             run = pipeline.read_run(bags, config, progress, (from_s, to_s), jobs)
-            solved = pipeline.solve_run(run, config, check_fixes=check_fixes, known=old, progress=progress)
+            placed = None
+            if old is not None and (old.datum is None or len(run.streams.fix_ns) < pipeline.LEAST_FIXES):
+                placed = pipeline.place(old, run, config, progress)
+            solved = pipeline.solve_run(
+                run, config, check_fixes=check_fixes, known=old, placed=placed, progress=progress
+            )
             topo, verdict = _save_results(solved, config, inputs, bags, folder, target, true, old, progress, accept)
     no_trees = pipeline.why_no_trees(solved)
     for note in run.notes:

@@ -433,7 +433,8 @@ def _unit(n: int) -> Any:
 
 def _estimate(problem: Problem, config: EstimateConfig, values: Any, p: Pass, linear: Any, seconds: float) -> Estimate:
     poses, trees = _path(problem, values), _trees(problem, values)
-    datum_cov = covariance.of_datum(problem, p.fix_scale, config)
+    # What a known map's frame is off by is in its trees' covariances already.
+    datum_cov = covariance.of_datum(problem, p.fix_scale, config) if problem.known is None else np.zeros((3, 3))
     joint = None
     tree_cov = np.full((problem.n_trees, 3, 3), np.nan)
     if linear is not None and problem.n_trees:

@@ -1,5 +1,6 @@
 """Straight lines: bags to a map, a map and bags to poses. `mapping` holds the one loop (associate <-> solve)."""
 
+from topograph.estimate.assemble import LEAST_FIXES
 from topograph.pipeline.auditing import audited
 from topograph.pipeline.inspecting import Inspection, Role, inspect_bags
 from topograph.pipeline.localizing import Replay, localize_bags
@@ -13,10 +14,13 @@ from topograph.pipeline.mapping import (
     topo_map,
     why_no_trees,
 )
+from topograph.pipeline.placing import Placed, place
 from topograph.pipeline.read import read_run, scan_near
 
 __all__ = [
+    "LEAST_FIXES",
     "Inspection",
+    "Placed",
     "Replay",
     "Role",
     "Solved",
@@ -26,6 +30,7 @@ __all__ = [
     "inspect_bags",
     "localize_bags",
     "map_T_scans",
+    "place",
     "read_run",
     "residual_metrics",
     "scan_near",

@@ -15,6 +15,7 @@ from topograph.estimate.assemble import assemble, choose_datum, without_wrong_he
 from topograph.evaluate import Metric, fix_metrics
 from topograph.geometry import Array, inverse, transform
 from topograph.motion import Motion, align_imu, dead_reckon, in_radians, without_nonsense
+from topograph.pipeline.placing import Placed, put
 from topograph.pipeline.read import Progress, silent
 from topograph.session import Session, Streams
 from topograph.topomap import SessionRecord, TopoMap, build, merge
@@ -77,11 +78,13 @@ def solve_run(
     *,
     check_fixes: int = 0,
     known: TopoMap | None = None,
+    placed: Placed | None = None,
     progress: Progress = silent,
 ) -> Solved:
     """Associate and solve. Every `check_fixes`-th fix is withheld from the estimator and kept for checking.
 
-    With a `known` map the run is put into its frame, and its trees are landmarks with their covariances.
+    With a `known` map the run is put into its frame, by GNSS or where it was `placed` in it, and its trees are landmarks with
+    their covariances.
 
     Raises:
         InsufficientDataError: neither motion nor fixes; or a known map and no common frame.
@@ -115,16 +118,23 @@ def solve_run(
     if check_fixes == 1:
         used[:] = False
     datum = choose_datum(run.streams, used)
-    if known is not None:
+    if known is not None and placed is None:
         if known.datum is None or datum is None:
-            raise InsufficientDataError("a map is extended in its own frame: both the map and the run need GNSS fixes")
+            raise InsufficientDataError(
+                "a map is extended in its own frame: the run has no GNSS in common with it, and was not placed in it"
+            )
         datum = known.datum
     keyframes = _keyframes(detections, motion, config)
     problem = assemble(
         keyframes, motion, config.motion, inertial, streams, used, antenna, baseline, datum, detections,
         config.estimate, skipped,
     )  # fmt: skip
-    if problem.datum is None:
+    if known is not None and placed is not None:
+        problem = put(problem, placed, known)
+        notes.append(
+            f"no GNSS in common with the map: the run was found in it by its trees, at {len(placed.stamps_ns)} places"
+        )
+    elif problem.datum is None:
         if known is not None:
             raise InsufficientDataError("too few GNSS fixes fall into the run to put it into the map's frame")
         notes.append("no usable GNSS fixes: the map is not georeferenced")

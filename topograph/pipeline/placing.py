@@ -1,0 +1,132 @@
+"""A run without common fixes is put into a map by finding the robot in it: what it is solved from, and held by."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from topograph.bags import Imu, Odometry
+from topograph.config import Config
+from topograph.errors import InsufficientDataError
+from topograph.estimate import Fixes, Headings, Problem
+from topograph.geometry import Array, Stamps, inverse, to_quaternion, transform, yaw_of
+from topograph.localize import Localizer
+from topograph.pipeline.read import Progress, silent
+from topograph.session import Session
+from topograph.topomap import TopoMap
+from topograph.trees.sightings import nearest_keyframe
+
+APART = 2.0
+"""Between two places that hold a run, m: they come from the same trunks as the graph's own factors, and must not outvote them."""
+SIGMA, SIGMA_YAW = 0.5, 0.1
+"""Of such a place, m and rad, for the same reason: the known trees say it better, once they are recognised."""
+LEAST = 3
+"""Places that hold a run."""
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """Where the localizer found a run in a map: stamps (F,) and `map_T_robot` (F, 4, 4)."""
+
+    stamps_ns: Stamps
+    map_T_robot: Array
+
+
+def place(topo: TopoMap, session: Session, config: Config, progress: Progress = silent) -> Placed:
+    """Find a run in a map, from anywhere, without GNSS.
+
+    Raises:
+        InsufficientDataError: it has no wheels, or is nowhere on the map as surely as `config.localize.risk` asks for.
+    """
+    if not len(session.streams.odometry_ns):
+        raise InsufficientDataError(
+            "a run without GNSS is laid onto a map by its wheels and trunks: it has no wheel odometry"
+        )
+    imu = session.mounts.get("imu")
+    localizer = Localizer(
+        topo,
+        config.localize,
+        child_T_robot=session.child_T_robot,
+        robot_R_imu=None if imu is None else imu[:3, :3],
+    )
+    messages = _messages(session)
+    ahead = next(messages, None)
+    stamps: list[int] = []
+    poses: list[Array] = []
+    states = set()
+    for n, trunks in enumerate(session.trunks):
+        heard = []
+        while ahead is not None and ahead.stamp_ns <= trunks.stamp_ns + AHEAD_NS:
+            heard.append(ahead)
+            ahead = next(messages, None)
+        fix = localizer.update(trunks, heard)
+        if localizer.report is not None:
+            states.add(localizer.report.state)
+        if fix is not None:
+            stamps.append(fix.stamp_ns)
+            poses.append(fix.map_T_robot)
+        if n % 100 == 0:
+            progress("place", n / len(session.trunks))
+    progress("place", 1.0)
+    kept = _spread(np.array(poses).reshape(-1, 4, 4))
+    if len(kept) < LEAST:
+        why = "several places fit it" if "ambiguous" in states else "no place fits it well enough"
+        raise InsufficientDataError(
+            f"the run has no GNSS in common with the map, and was not found in it by its trees ({why}): drive further, or through more of "
+            "what the map knows"
+        )
+    return Placed(np.array(stamps, np.int64)[kept], np.array(poses)[kept])
+
+
+AHEAD_NS = 100_000_000
+"""Messages so much newer than a scan are heard with it, as live: wheels on both sides of it."""
+
+
+def _messages(session: Session) -> Iterator[Odometry | Imu]:
+    """The wheels and the IMU of a run, as they were recorded, in order of stamps."""
+    s = session.streams
+    child, imu = s.frames.get("child", ""), s.frames.get("imu", "")
+    pose = np.concatenate([s.odom_T_child[:, :3, 3], to_quaternion(s.odom_T_child)], axis=1)
+    i = 0
+    for k, ns in enumerate(s.odometry_ns.tolist()):
+        while i < len(s.imu_ns) and s.imu_ns[i] <= ns:
+            yield Imu(int(s.imu_ns[i]), imu, s.gyro[i], s.accel[i])
+            i += 1
+        yield Odometry(ns, child, pose[k], s.twist[k])
+    for j in range(i, len(s.imu_ns)):
+        yield Imu(int(s.imu_ns[j]), imu, s.gyro[j], s.accel[j])
+
+
+def _spread(poses: Array) -> NDArray[np.int64]:
+    """Rows of poses (F, 4, 4) that are at least `APART` from the one before."""
+    kept: list[int] = []
+    for k, p in enumerate(poses[:, :2, 3]):
+        if not kept or np.linalg.norm(p - poses[kept[-1], :2, 3]) > APART:
+            kept.append(k)
+    return np.array(kept, np.int64)
+
+
+def put(problem: Problem, placed: Placed, topo: TopoMap) -> Problem:
+    """The problem of a run in the frame of a map: it starts where it was found, and is loosely held there."""
+    ns = problem.stamps_ns
+    motion = problem.motion
+    k = nearest_keyframe(placed.stamps_ns, ns)
+    keyframe_T_robot = inverse(problem.odom_T_robot[k]) @ motion.at(placed.stamps_ns)
+    found = placed.map_T_robot @ inverse(keyframe_T_robot)  # map_T_keyframe
+    # Each keyframe from the place found next to it, by dead reckoning between the two.
+    near = nearest_keyframe(ns, placed.stamps_ns)
+    start = found[near] @ inverse(problem.odom_T_robot[k[near]]) @ problem.odom_T_robot
+    n = len(k)
+    fixes = Fixes(
+        keyframe=k,
+        keyframe_p_antenna=keyframe_T_robot[:, :3, 3],
+        map_p_antenna=placed.map_T_robot[:, :3, 3],
+        cov=np.tile(SIGMA**2 * np.eye(3), (n, 1, 1)),
+        late=np.zeros((n, 3)),
+    )
+    forward = transform(keyframe_T_robot, np.array([1.0, 0.0, 0.0])) - keyframe_T_robot[:, :3, 3]
+    headings = Headings(k, forward, yaw_of(placed.map_T_robot), np.full(n, SIGMA_YAW))
+    return replace(problem, start=start, fixes=fixes, headings=headings, datum=topo.datum)

@@ -71,13 +71,14 @@ def exists(
     hits = np.bincount(tree[used], minlength=n)
     weight = _weight(d, used)
     score = np.bincount(tree[used], weight * d.score[used], n) / np.maximum(np.bincount(tree[used], weight, n), 1e-9)
-    scan, which = _pairs(d, map_T_scan, places)
-    seen = np.isin(scan * n + which, d.scan[used] * n + tree[used])
-    p = _seen_from(map_T_scan, scan, places, which)
     passed = np.zeros(n, np.int64)
     # A few false detections may fall on one spot; a tree of the run's own kind is seen far more often.
     typical = float(np.median(hits[hits >= config.min_sightings])) if (hits >= config.min_sightings).any() else 0.0
     ok = hits >= max(config.min_sightings, config.min_share * typical)
+    # What was seen too seldom does not exist whatever scans say of its place: clutter is many times the trees, and grows with the run.
+    scan, which = _pairs(d, map_T_scan, places, ok)
+    seen = np.isin(scan * n + which, d.scan[used] * n + tree[used])
+    p = _seen_from(map_T_scan, scan, places, which)
     if len(d.free):
         through = _through(d, scan, p) & ~seen
         passed = np.bincount(which[through], minlength=n)
@@ -101,7 +102,7 @@ def seen_through(detections: Detections, map_T_scan: Array, places: Array) -> ND
     """Scans (T,) that saw through each of `places` (T, 3) at trunk height; zeros where scans do not tell what they passed."""
     if not len(detections.free):
         return np.zeros(len(places), np.int64)
-    scan, which = _pairs(detections, map_T_scan, places)
+    scan, which = _pairs(detections, map_T_scan, places, np.ones(len(places), bool))
     through = _through(detections, scan, _seen_from(map_T_scan, scan, places, which))
     return np.bincount(which[through], minlength=len(places))
 
@@ -120,14 +121,18 @@ def _usual(score: Array, hits: NDArray[np.int64]) -> float:
     return float(score[order[np.searchsorted(total, 0.5 * total[-1])]])
 
 
-def _pairs(d: Detections, map_T_scan: Array, places: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Scans and trees that are near each other, (P,) each: memory grows with the recording, not with the map."""
-    if not len(places) or not len(d.stamps_ns):
+def _pairs(
+    d: Detections, map_T_scan: Array, places: Array, asked: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Scans and trees `asked` (T,) for that are near each other, (P,) each: memory grows with the recording, not with the map."""
+    rows = np.flatnonzero(asked)
+    if not len(rows) or not len(d.stamps_ns):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     reach = REACH if len(d.free) else max(float(np.max(np.linalg.norm(d.p[:, :2], axis=1), initial=0.0)), 1.0)
-    near = cKDTree(places[:, :2]).query_ball_point(map_T_scan[:, :2, 3], reach)
-    rows = [np.asarray(k, np.int64) for k in near]
-    return np.repeat(np.arange(len(rows)), [len(k) for k in rows]), np.concatenate(rows)
+    near = cKDTree(places[rows, :2]).query_ball_point(map_T_scan[:, :2, 3], reach)
+    count = [len(k) for k in near]
+    which = np.fromiter((i for k in near for i in k), np.int64, sum(count))
+    return np.repeat(np.arange(len(near)), count), rows[which]
 
 
 def _seen_from(map_T_scan: Array, scan: NDArray[np.int64], places: Array, which: NDArray[np.int64]) -> Array:

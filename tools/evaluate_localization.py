@@ -352,6 +352,30 @@ def track(seed: int, quick: float) -> None:
         )  # fmt: skip
 
 
+def latency(seed: int, quick: float) -> None:
+    """CPU time of this thread for each update while tracking, against the size of the map."""
+    for n in (1000, 10_000, 100_000):
+        for name in ("A", "B", "D"):
+            c = replace(SCENARIOS[name], trees=n)
+            config = told(c)
+            rng = np.random.default_rng([seed, 11])
+            w = world(c, rng)
+            engine = Engine(index_of(w, c, config), config)
+            ms, searching, lost = [], [], 0
+            for s in drive(w, c, rng, max(20.0, 150.0 * quick)):
+                began = time.thread_time()
+                tracked_before = engine.track is not None
+                feed(engine, s, c)
+                (ms if tracked_before else searching).append(1e3 * (time.thread_time() - began))
+                lost = engine.losses
+            q = np.array(ms) if ms else np.full(1, np.nan)
+            print(
+                f"{name} {n:>7} trees  tracking n={len(ms):<4} median {np.median(q):6.1f}  p99 {np.percentile(q, 99):6.1f}  max {q.max():6.1f} ms;  "
+                f"searching n={len(searching):<4} max {max(searching, default=np.nan):6.1f} ms;  lost {lost}",
+                flush=True,
+            )
+
+
 def cost(seed: int, quick: float, picture: Path) -> None:
     """Search time, update time and memory against the size of the map, on one core, drawn to `picture`."""
     from topograph.localize.evidence import describe, weigh
@@ -392,7 +416,9 @@ def cost(seed: int, quick: float, picture: Path) -> None:
 def main() -> None:
     """Run one of the experiments."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["starts", "thesis", "risk", "mismatch", "nowhere", "kidnap", "track", "cost"])
+    parser.add_argument(
+        "what", choices=["starts", "thesis", "risk", "mismatch", "nowhere", "kidnap", "track", "latency", "cost"]
+    )
     parser.add_argument("--seed", type=int, default=1_000_000)
     parser.add_argument("--quick", type=float, default=1.0, help="Share of the runs.")
     parser.add_argument("--picture", type=Path, default=Path("cost.png"))

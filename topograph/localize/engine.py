@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +15,7 @@ from topograph.localize.evidence import Posterior, describe, nothing, weigh
 from topograph.localize.filter import Filter
 from topograph.localize.hypothesis import Hypothesis
 from topograph.localize.index import MapIndex
-from topograph.localize.search import Found, search
+from topograph.localize.search import Found, Landmarks, search, searching
 from topograph.localize.submap import BINS, Move, Submap, Sweep, Visibility, absorb, assign, in_reach, in_view, sectors
 
 ASTRAY = 0.3
@@ -68,6 +69,7 @@ class _Hunt:
     searched: float = -1e9
     weighed: tuple[float, int] = (-1e9, 0)
     informed: bool = False
+    search: Iterator[Found | None] | None = None
 
 
 class Engine:
@@ -136,13 +138,7 @@ class Engine:
             return False
         h.weighed = key
         marks, rows = describe(h.submap, self.index, c)
-        s2 = self.index.jitter**2
-        bits = np.log1p(s2 / (marks.var + c.map_sigma**2)) * marks.lasting
-        if self.index.diameter_sd > 0:
-            ok = np.isfinite(marks.diameter)
-            bits[ok] += 0.5 * np.log1p(self.index.diameter_sd**2 / marks.diameter_var[ok]) * marks.lasting[ok]
-        need = c.information * np.log(4.0 * len(self.index) / c.risk)
-        if float(bits.sum()) < need and (len(marks) < 10 or f.run - h.searched < 2 * c.again):
+        if self._bits(marks) < self._need() and (len(marks) < 10 or f.run - h.searched < 2 * c.again):
             return False  # too little to decide; where planting is regular, the places that are left are still counted
         h.informed = True
         small = len(self.index.length) < 10000
@@ -154,6 +150,41 @@ class Engine:
         h.searched = f.run
         h.posterior, h.rows = weigh(h.found, marks, h.submap, self.index, c), rows
         return True
+
+    def _glance(self) -> bool:
+        """`_look` while tracking: in slices, so that no scan waits for a large map; whether the posterior is of the submap as it is now.
+
+        A search that took several scans tells where the submap's frame lies; what that is worth is weighed by the landmarks of now.
+        """
+        h, c = self.hunt, self.config
+        if h.search is None:
+            h.searched = h.submap.filter.run
+            if h.submap.filter.n < 2:
+                return False
+            marks, _ = describe(h.submap, self.index, c)
+            if self._bits(marks) < self._need():
+                return False
+            h.search = searching(marks, self.index, c)
+        found = next(h.search)
+        if found is None:
+            return False
+        h.search, h.found, h.informed = None, found, True
+        marks, rows = describe(h.submap, self.index, c)
+        h.posterior, h.rows = weigh(found, marks, h.submap, self.index, c), rows
+        return True
+
+    def _bits(self, marks: Landmarks) -> float:
+        """Nats that the landmarks tell of where they are, at most."""
+        s2 = self.index.jitter**2
+        bits = np.log1p(s2 / (marks.var + self.config.map_sigma**2)) * marks.lasting
+        if self.index.diameter_sd > 0:
+            ok = np.isfinite(marks.diameter)
+            bits[ok] += 0.5 * np.log1p(self.index.diameter_sd**2 / marks.diameter_var[ok]) * marks.lasting[ok]
+        return float(bits.sum())
+
+    def _need(self) -> float:
+        """Nats below which a search cannot decide."""
+        return float(self.config.information * np.log(4.0 * len(self.index) / self.config.risk))
 
     @staticmethod
     def _kept(h: _Hunt) -> Found:
@@ -286,9 +317,8 @@ class Engine:
         """A second opinion without a prior, from a submap that begins anew every few metres."""
         h, c = self.hunt, self.config
         f = h.submap.filter
-        if f.run - h.searched >= 1.0 or f.run >= c.shadow:
-            renewed = self._look()  # an older posterior speaks of landmarks that may have been dropped since
-            h.searched = f.run
+        if h.search is not None or f.run - h.searched >= 1.0 or f.run >= c.shadow:
+            renewed = self._glance()  # an older posterior speaks of landmarks that may have been dropped since
             p = h.posterior
             if renewed and len(p.pose) and p.risk <= OVERRULE * c.risk and self.track is not None:
                 other = anchored(h, self.index, c)
@@ -299,7 +329,7 @@ class Engine:
                     self._commit()
                     return
                 self.risk = p.risk
-        if f.run >= c.shadow:
+        if f.run >= c.shadow and h.search is None:
             self.hunt = _Hunt(Submap(c, self.visibility))
 
     def _lose(self, sweep: Sweep) -> None:

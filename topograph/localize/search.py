@@ -6,6 +6,7 @@ scored landmark by landmark and dropped once it is `bound` nats behind the best.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,12 +67,28 @@ def spread(m: Array, cov: Array) -> Array:
     return np.asarray(np.maximum(0.5 * (v[0::2] + v[1::2]), 1e-6))
 
 
+SLICE = 8_000
+"""Pairs of trees that are tried at once while tracking: some ten milliseconds."""
+FEWER = 40
+"""Placements that are weighed with their full covariance while tracking; those beyond count as rivals all the same."""
+
+
 def search(marks: Landmarks, index: MapIndex, config: LocalizeConfig) -> Found:
     """Placements within `config.bound` nats of the best."""
+    for found in searching(marks, index, config, len(index.length) + 1, config.modes):
+        if found is not None:
+            return found
+    raise AssertionError("a search ends with what it found")
+
+
+def searching(
+    marks: Landmarks, index: MapIndex, config: LocalizeConfig, size: int = SLICE, modes: int = FEWER
+) -> Iterator[Found | None]:
+    """`search` in slices of so many pairs of trees: None while it goes on, then what it found."""
     pairs = _anchors(marks, index, config)
     poses: list[Array] = []
     losses: list[Array] = []
-    best, seeds, missed = np.inf, 0, 1.0
+    best, seeds, tried, missed = np.inf, 0, 0, 1.0
     order_all = np.argsort(marks.var - 0.02 * marks.lasting)
     alone = marks.tree - marks.other  # what a landmark costs that is no mapped tree
     typical = float(np.sum(np.maximum(alone - np.log(2 * np.pi * (marks.var + config.map_sigma**2)), 0.0)))
@@ -79,29 +96,35 @@ def search(marks: Landmarks, index: MapIndex, config: LocalizeConfig) -> Found:
         if missed < config.anchors and (best < 0.5 * typical or used >= 6):
             break
         order = np.concatenate([[i, j], order_all[(order_all != i) & (order_all != j)]]).astype(np.int64)
-        a, b = index.a[low:high], index.b[low:high]
-        if len(a) > 5000:  # neighbours after each other: the raster's cells are still in the processor's cache
-            near = np.argsort(index.place[a], kind="stable")
-            a, b = a[near], b[near]
-        pose, loss, best = _seed(
-            marks.m, marks.var, marks.diameter, marks.diameter_var, marks.other - marks.tree, order,
-            a, b, index.xy, index.var, index.diameter, index.diameter_mean,
-            index.diameter_sd, index.origin, index.cell, index.nearest, best, config.bound, config.map_sigma,
-        )  # fmt: skip
-        poses.append(pose)
-        losses.append(loss)
+        for at in range(low, high, size):
+            a, b = index.a[at : min(at + size, high)], index.b[at : min(at + size, high)]
+            if len(a) > 5000:  # neighbours after each other: the raster's cells are still in the processor's cache
+                near = np.argsort(index.place[a], kind="stable")
+                a, b = a[near], b[near]
+            pose, loss, best = _seed(
+                marks.m, marks.var, marks.diameter, marks.diameter_var, marks.other - marks.tree, order,
+                a, b, index.xy, index.var, index.diameter, index.diameter_mean,
+                index.diameter_sd, index.origin, index.cell, index.nearest, best, config.bound, config.map_sigma,
+            )  # fmt: skip
+            poses.append(pose)
+            losses.append(loss)
+            tried += len(a)
+            if tried >= size:
+                tried = 0
+                yield None
         seeds += 2 * (high - low)
         missed *= 1.0 - p_both
     if not poses:
-        return Found(np.zeros((0, 3)), np.zeros(0), 0.0, 0)
+        yield Found(np.zeros((0, 3)), np.zeros(0), 0.0, 0)
+        return
     pose, loss = np.concatenate(poses), np.concatenate(losses)
     good = loss < best + config.bound
     pose, loss = pose[good], loss[good]
     rows = np.argsort(loss)
     if len(rows) > 20000:
         rows = rows[:20000]
-    kept, rest = _distinct(pose[rows], loss[rows], marks.m.mean(0), config.modes)
-    return Found(pose[rows][kept], loss[rows][kept], rest * (len(loss) / max(len(rows), 1)), seeds)
+    kept, rest = _distinct(pose[rows], loss[rows], marks.m.mean(0), modes)
+    yield Found(pose[rows][kept], loss[rows][kept], rest * (len(loss) / max(len(rows), 1)), seeds)
 
 
 def _anchors(marks: Landmarks, index: MapIndex, config: LocalizeConfig) -> list[tuple[int, int, float, int, int]]:

@@ -129,10 +129,9 @@ def _pairs(
     if not len(rows) or not len(d.stamps_ns):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     reach = REACH if len(d.free) else max(float(np.max(np.linalg.norm(d.p[:, :2], axis=1), initial=0.0)), 1.0)
-    near = cKDTree(places[rows, :2]).query_ball_point(map_T_scan[:, :2, 3], reach)
-    count = [len(k) for k in near]
-    which = np.fromiter((i for k in near for i in k), np.int64, sum(count))
-    return np.repeat(np.arange(len(near)), count), rows[which]
+    found = cKDTree(places[rows, :2]).query_ball_point(map_T_scan[:, :2, 3], reach)
+    near = [np.asarray(k, np.int64) for k in found]
+    return np.repeat(np.arange(len(near)), [len(k) for k in near]), rows[np.concatenate(near)]
 
 
 def _seen_from(map_T_scan: Array, scan: NDArray[np.int64], places: Array, which: NDArray[np.int64]) -> Array:

@@ -80,16 +80,36 @@ def from_dict(data: dict[str, Any]) -> Config:
         for key in block or {}:
             if key not in known:
                 raise UsageError(f"configuration: unknown key '{room}.{key}'; known are {', '.join(known)}")
-    try:
-        blocks = {
-            room: TypeAdapter(type(getattr(Config(), room))).validate_python(block or {})
-            for room, block in data.items()
-        }
-    except ValidationError as err:
-        first = err.errors()[0]
-        where = ".".join(str(w) for w in first["loc"])
-        raise UsageError(f"configuration: {where}: {first['msg']}") from err
-    return Config(**blocks)
+    blocks = {}
+    for room, block in data.items():
+        try:
+            blocks[room] = TypeAdapter(type(getattr(Config(), room))).validate_python(block or {})
+        except ValidationError as err:
+            first = err.errors()[0]
+            where = ".".join([room, *(str(w) for w in first["loc"])])
+            raise UsageError(f"configuration: {where}: {first['msg']}, not {first['input']!r}") from err
+    config = Config(**blocks)
+    _consistent(config)
+    return config
+
+
+def _consistent(config: Config) -> None:
+    """Settings that must fit each other.
+
+    Raises:
+        UsageError: they do not.
+    """
+    t, c = config.trunks, config.localize
+    for low, high, names in (
+        (t.low, t.high, "trunks.low, trunks.high"),
+        (t.thinnest, t.widest, "trunks.thinnest, trunks.widest"),
+        (t.nearest, t.farthest, "trunks.nearest, trunks.farthest"),
+        (config.thesis_trunks.z_min, config.thesis_trunks.z_max, "thesis_trunks.z_min, thesis_trunks.z_max"),
+    ):
+        if low >= high:
+            raise UsageError(f"configuration: {names}: {low} is not below {high}")
+    if not c.scales or len(c.scales) != len(c.scale_prior):
+        raise UsageError("configuration: localize.scales and localize.scale_prior: each scale needs one prior")
 
 
 def dump(config: Config) -> str:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from topograph.geometry import Array, Datum, Stamps
 from topograph.motion import Inertial, Motion, MotionConfig
+from topograph.ranges import Count, NonNegative, Positive
 from topograph.trees import Detections, Sightings
 
 
@@ -31,21 +32,21 @@ class EstimateConfig:
         d_max: of the thesis's Algorithm 3, m.
     """
 
-    keyframe_distance: float = 0.5
-    keyframe_turn: float = 0.2
-    keyframe_seconds: float = 5.0
-    fix_floor: tuple[float, float] = (0.01, 0.02)
-    fix_correlation_s: float = 6.0
-    heading_floor: float = 0.005
-    huber: float = 1.345
-    tukey: float = 4.685
-    tree_floor: float = 0.003
+    keyframe_distance: Positive = 0.5
+    keyframe_turn: Positive = 0.2
+    keyframe_seconds: Positive = 5.0
+    fix_floor: tuple[Positive, Positive] = (0.01, 0.02)
+    fix_correlation_s: Positive = 6.0
+    heading_floor: Positive = 0.005
+    huber: Positive = 1.345
+    tukey: Positive = 4.685
+    tree_floor: NonNegative = 0.003
     use_imu: bool = True
     learn_scale: bool = True
-    most_sightings: int = 30
-    quick_sightings: int = 25
-    iterations: int = 40
-    d_max: float = 1.5
+    most_sightings: Count = 30
+    quick_sightings: Count = 25
+    iterations: Count = 40
+    d_max: Positive = 1.5
 
 
 @dataclass(frozen=True, slots=True)

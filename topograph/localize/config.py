@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from topograph.ranges import Chance, Count, NonNegative, Positive, Share
+
 
 @dataclass(frozen=True, slots=True)
 class LocalizeConfig:
@@ -43,39 +45,39 @@ class LocalizeConfig:
         planar_tilt: deviation of roll and pitch where no IMU holds them.
     """
 
-    risk: float = 1e-4
-    view: float = 25.0
-    seen: float = 0.8
-    clutter: float = 0.1
-    new: float = 0.04
-    felled: float = 0.04
-    map_sigma: float = 0.03
-    trunk_sigma: float = 0.015
-    diameter_sigma: float = 0.03
-    scales: tuple[float, ...] = (1.0, 1.5, 2.2)
-    scale_prior: tuple[float, ...] = (0.9, 0.07, 0.03)
-    unknown: float = 0.02
-    alike: float = 1e-4
-    gate: float = 13.8
-    pair: float = 16.0
-    anchors: float = 1e-3
-    bound: float = 25.0
-    modes: int = 300
-    information: float = 0.35
-    again: float = 2.0
-    landmarks: int = 40
-    forget: float = 40.0
-    lost: float = 12.0
-    slip: float = 12.0
-    shadow: float = 5.0
-    degraded: float = 0.3
-    along: float = 0.03
-    across: float = 0.02
-    step: float = 0.004
-    yaw_gyro: float = 0.004
-    yaw_rate: float = 5e-4
-    yaw_wheels: float = 0.08
-    yaw_distance: float = 0.01
-    planar_tilt: float = 0.06
+    risk: Chance = 1e-4
+    view: Positive = 25.0
+    seen: Chance = 0.8
+    clutter: Share = 0.1
+    new: Chance = 0.04
+    felled: Chance = 0.04
+    map_sigma: Positive = 0.03
+    trunk_sigma: NonNegative = 0.015
+    diameter_sigma: Positive = 0.03
+    scales: tuple[Positive, ...] = (1.0, 1.5, 2.2)
+    scale_prior: tuple[Positive, ...] = (0.9, 0.07, 0.03)
+    unknown: Chance = 0.02
+    alike: Chance = 1e-4
+    gate: Positive = 13.8
+    pair: Positive = 16.0
+    anchors: Chance = 1e-3
+    bound: Positive = 25.0
+    modes: Count = 300
+    information: Positive = 0.35
+    again: Positive = 2.0
+    landmarks: Count = 40
+    forget: Positive = 40.0
+    lost: Positive = 12.0
+    slip: Positive = 12.0
+    shadow: Positive = 5.0
+    degraded: Positive = 0.3
+    along: Positive = 0.03
+    across: Positive = 0.02
+    step: Positive = 0.004
+    yaw_gyro: Positive = 0.004
+    yaw_rate: Positive = 5e-4
+    yaw_wheels: Positive = 0.08
+    yaw_distance: Positive = 0.01
+    planar_tilt: Positive = 0.06
     estimator: Literal["graph", "filter"] = "graph"
     measure: Literal["both", "ranges", "bearings"] = "both"

@@ -21,6 +21,7 @@ from topograph.bags import Trunks
 from topograph.geometry import Array, from_xyz_rpy, transform
 from topograph.localize.method import Fix, Report
 from topograph.motion import Leg
+from topograph.ranges import Count, NonNegative, Positive
 from topograph.topomap import TopoMap
 
 
@@ -37,15 +38,15 @@ class ThesisConfig:
         merge: poses nearer than this are one.
     """
 
-    distance: float = 0.3
-    consistency: float = 0.3
-    icp: float = 0.05
-    gate: float = 1.0
-    count: int = 5
-    view: float = 10.0
-    trunks: int = 5
-    combinations: int = 2000
-    merge: float = 0.3
+    distance: Positive = 0.3
+    consistency: Positive = 0.3
+    icp: NonNegative = 0.05
+    gate: Positive = 1.0
+    count: Count = 5
+    view: Positive = 10.0
+    trunks: Count = 5
+    combinations: Count = 2000
+    merge: Positive = 0.3
 
 
 class ThesisMethod:

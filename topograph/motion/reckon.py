@@ -22,6 +22,7 @@ from topograph.geometry import (
 )
 from topograph.motion.inertial import GRAVITY, Inertial
 from topograph.motion.wheels import against_fixes
+from topograph.ranges import Positive
 from topograph.session import Streams
 
 
@@ -39,16 +40,16 @@ class MotionConfig:
         tilt_time_s: time constant of the complementary filter that holds roll and pitch to gravity.
     """
 
-    along: float = 0.02
-    across: float = 0.02
-    up: float = 0.02
-    step: float = 0.003
-    yaw_gyro: float = 0.004
-    yaw_wheels: float = 0.08
-    yaw_rate: float = 4e-4
-    yaw_distance: float = 0.006
-    tilt_distance: float = 0.012
-    tilt_time_s: float = 4.0
+    along: Positive = 0.02
+    across: Positive = 0.02
+    up: Positive = 0.02
+    step: Positive = 0.003
+    yaw_gyro: Positive = 0.004
+    yaw_wheels: Positive = 0.08
+    yaw_rate: Positive = 4e-4
+    yaw_distance: Positive = 0.006
+    tilt_distance: Positive = 0.012
+    tilt_time_s: Positive = 4.0
 
 
 @dataclass(frozen=True, slots=True)

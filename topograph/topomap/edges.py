@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from topograph.geometry import Array
+from topograph.ranges import Count, Positive, Share
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,11 +26,11 @@ class TopomapConfig:
         voxel: of a viewpoint cloud, m.
     """
 
-    edges: str = "gabriel"
-    radius: float = 8.0
-    viewpoint_cosine: float = 0.87
-    clouds_per_viewpoint: int = 10
-    voxel: float = 0.02
+    edges: Literal["gabriel", "radius"] = "gabriel"
+    radius: Positive = 8.0
+    viewpoint_cosine: Share = 0.87
+    clouds_per_viewpoint: Count = 10
+    voxel: Positive = 0.02
 
 
 def neighbours(xy: Array, config: TopomapConfig) -> NDArray[np.int64]:

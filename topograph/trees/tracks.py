@@ -10,6 +10,7 @@ from scipy.optimize import linear_sum_assignment
 
 from topograph.geometry import Array, transform
 from topograph.motion import Motion
+from topograph.ranges import Chance, Count, NonNegative, Positive, Share
 from topograph.trees.detections import Detections
 from topograph.trees.gating import gated, seen_again
 
@@ -34,20 +35,20 @@ class TreesConfig:
         min_share: of the sightings that trees of the same run have at the median.
     """
 
-    gate: float = 11.8
-    floor: float = 0.06
-    drift: float = 0.03
-    forget: float = 8.0
-    window: float = 4.0
-    recent: float = 25.0
-    mapped: float = 0.6
-    margin: float = 7.0
-    merge: float = 0.5
-    min_sightings: int = 6
-    min_ratio: float = 0.15
-    passed: float = 0.1
-    usual_score: float = 0.27
-    min_share: float = 0.03
+    gate: Positive = 11.8
+    floor: Positive = 0.06
+    drift: NonNegative = 0.03
+    forget: Positive = 8.0
+    window: Positive = 4.0
+    recent: Positive = 25.0
+    mapped: Chance = 0.6
+    margin: NonNegative = 7.0
+    merge: Positive = 0.5
+    min_sightings: Count = 6
+    min_ratio: Share = 0.15
+    passed: NonNegative = 0.1
+    usual_score: NonNegative = 0.27
+    min_share: Share = 0.03
 
 
 class Tracker:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from topograph.ranges import NonNegative, Positive, Real
+
 LEAST_CLOUD = 8
 """Points of a trunk below which they show no side of it."""
 MOST_CLOUD = 120
@@ -31,18 +33,18 @@ class TrunksConfig:
     """
 
     front_end: Literal["organised", "thesis"] = "organised"
-    nearest: float = 0.8
-    farthest: float = 30.0
-    low: float = 0.25
-    high: float = 1.7
-    reference: float = 0.8
-    thinnest: float = 0.05
-    widest: float = 1.3
-    prior_diameter: float = 0.25
-    prior_sigma: float = 0.09
-    min_score: float = -3.0
+    nearest: Positive = 0.8
+    farthest: Positive = 30.0
+    low: Positive = 0.25
+    high: Positive = 1.7
+    reference: Positive = 0.8
+    thinnest: Positive = 0.05
+    widest: Positive = 1.3
+    prior_diameter: Positive = 0.25
+    prior_sigma: Positive = 0.09
+    min_score: Real = -3.0
     score: str = ""
-    recorded_sigma: float = 0.05
-    recorded_growth: float = 0.01
-    recorded_along: float = 5.0
-    recorded_reach: float = 40.0
+    recorded_sigma: Positive = 0.05
+    recorded_growth: NonNegative = 0.01
+    recorded_along: Positive = 5.0
+    recorded_reach: Positive = 40.0

@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from topograph.bags import Scan, Trunks
 from topograph.geometry import Array, transform
+from topograph.ranges import Count, Positive, Real
 from topograph.trunks.open3d_door import open3d
 
 SURFACE_SIGMA = 0.12
@@ -41,22 +42,22 @@ class ThesisTrunksConfig:
         farthest: clusters beyond are left out.
     """
 
-    z_min: float = -0.36
-    z_max: float = 0.69
+    z_min: Real = -0.36
+    z_max: Real = 0.69
     intensity_min: float = float("-inf")
     intensity_max: float = float("inf")
-    normal_neighbours: int = 11
-    plane_distance: float = 0.15
-    plane_angle: float = 38.0
-    radius: float = 0.33
-    radius_neighbours: int = 3
-    mean_neighbours: int = 20
-    deviations: float = 1.66
-    cluster_distance: float = 0.48
-    cluster_angle: float = 52.0
-    cluster_min: int = 8
-    cluster_max: int = 979
-    farthest: float = 30.0
+    normal_neighbours: Count = 11
+    plane_distance: Positive = 0.15
+    plane_angle: Positive = 38.0
+    radius: Positive = 0.33
+    radius_neighbours: Count = 3
+    mean_neighbours: Count = 20
+    deviations: Positive = 1.66
+    cluster_distance: Positive = 0.48
+    cluster_angle: Positive = 52.0
+    cluster_min: Count = 8
+    cluster_max: Count = 979
+    farthest: Positive = 30.0
 
 
 class ThesisDetector:

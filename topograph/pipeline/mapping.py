@@ -388,13 +388,25 @@ def _associate_and_solve(
         estimate = replace(graph.solve(decided.problem, config.estimate), tree=decided.tree)
         progress("solve", (n + 1) / LAST_ROUNDS)
         after = a.decide(estimate)
-        if np.array_equal(after.tree, decided.tree) and np.array_equal(after.shapes.forked, decided.shapes.forked):
+        if _settled(after, decided):
             turned = np.abs(after.shapes.slope - decided.shapes.slope).max(initial=0.0)
             decided = replace(decided, shapes=after.shapes)  # as the last path has them
             if turned < SETTLED:
                 break
     progress("solve", 1.0)
     return decided, estimate, a.closer.loops
+
+
+FLIPS = 1e-4
+"""Share of the detections that may go to and fro between two trees: nothing moves by them."""
+
+
+def _settled(after: _Decided, before: _Decided) -> bool:
+    """The same trees, made of the same detections."""
+    if not np.array_equal(after.problem.tree_ids, before.problem.tree_ids):
+        return False
+    flips = int((after.tree != before.tree).sum())
+    return flips <= FLIPS * len(after.tree) and np.array_equal(after.shapes.forked, before.shapes.forked)
 
 
 LAST_ROUNDS = 4

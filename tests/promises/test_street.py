@@ -8,8 +8,8 @@ import recordings as rec
 
 from topograph.config import Config
 from topograph.geometry import transform
+from topograph.mapping import map_T_scans
 from topograph.pipeline import read_run, solve_run
-from topograph.pipeline.mapping import map_T_scans
 
 
 def test_nodes_stand_still_and_stop_the_beam(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> None:

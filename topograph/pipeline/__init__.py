@@ -1,20 +1,19 @@
-"""Straight lines: bags to a map, a map and bags to poses. `mapping` holds the one loop (associate <-> solve)."""
+"""Straight lines: bags to a map, a map and bags to poses."""
 
 from topograph.estimate.assemble import LEAST_FIXES
+from topograph.mapping import Placed, Solved, map_T_scans
 from topograph.pipeline.auditing import audited
 from topograph.pipeline.inspecting import Inspection, Role, inspect_bags
 from topograph.pipeline.localizing import Replay, localize_bags
 from topograph.pipeline.mapping import (
-    Solved,
     baseline,
     extend,
-    map_T_scans,
     residual_metrics,
     solve_run,
     topo_map,
     why_no_trees,
 )
-from topograph.pipeline.placing import Placed, place
+from topograph.pipeline.placing import place
 from topograph.pipeline.read import read_run, scan_near
 
 __all__ = [

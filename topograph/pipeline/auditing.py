@@ -7,8 +7,8 @@ import numpy as np
 from topograph import audit
 from topograph.audit import Finding, Verdict
 from topograph.geometry import Array
+from topograph.mapping import Solved
 from topograph.motion import mount_turn
-from topograph.pipeline.mapping import Solved
 from topograph.topomap.map import TREE
 
 

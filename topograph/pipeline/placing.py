@@ -1,9 +1,8 @@
-"""A run without common fixes is put into a map by finding the robot in it: what it is solved from, and held by."""
+"""A run without common fixes is put into a map by finding the robot in it: see mapping/known.py."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,28 +10,17 @@ from numpy.typing import NDArray
 from topograph.bags import Imu, Odometry
 from topograph.config import Config
 from topograph.errors import InsufficientDataError
-from topograph.estimate import Fixes, Headings, Problem
-from topograph.geometry import Array, Stamps, inverse, to_quaternion, transform, yaw_of
+from topograph.geometry import Array, to_quaternion
 from topograph.localize import Localizer
+from topograph.mapping import Placed
 from topograph.pipeline.read import Progress, silent
 from topograph.session import Session
 from topograph.topomap import TopoMap
-from topograph.trees.sightings import nearest_keyframe
 
 APART = 2.0
 """Between two places that hold a run, m: they come from the same trunks as the graph's own factors, and must not outvote them."""
-SIGMA, SIGMA_YAW = 0.5, 0.1
-"""Of such a place, m and rad, for the same reason: the known trees say it better, once they are recognised."""
 LEAST = 3
 """Places that hold a run."""
-
-
-@dataclass(frozen=True, slots=True)
-class Placed:
-    """Where the localizer found a run in a map: stamps (F,) and `map_T_robot` (F, 4, 4)."""
-
-    stamps_ns: Stamps
-    map_T_robot: Array
 
 
 def place(topo: TopoMap, session: Session, config: Config, progress: Progress = silent) -> Placed:
@@ -107,26 +95,3 @@ def _spread(poses: Array) -> NDArray[np.int64]:
         if not kept or np.linalg.norm(p - poses[kept[-1], :2, 3]) > APART:
             kept.append(k)
     return np.array(kept, np.int64)
-
-
-def put(problem: Problem, placed: Placed, topo: TopoMap) -> Problem:
-    """The problem of a run in the frame of a map: it starts where it was found, and is loosely held there."""
-    ns = problem.stamps_ns
-    motion = problem.motion
-    k = nearest_keyframe(placed.stamps_ns, ns)
-    keyframe_T_robot = inverse(problem.odom_T_robot[k]) @ motion.at(placed.stamps_ns)
-    found = placed.map_T_robot @ inverse(keyframe_T_robot)  # map_T_keyframe
-    # Each keyframe from the place found next to it, by dead reckoning between the two.
-    near = nearest_keyframe(ns, placed.stamps_ns)
-    start = found[near] @ inverse(problem.odom_T_robot[k[near]]) @ problem.odom_T_robot
-    n = len(k)
-    fixes = Fixes(
-        keyframe=k,
-        keyframe_p_antenna=keyframe_T_robot[:, :3, 3],
-        map_p_antenna=placed.map_T_robot[:, :3, 3],
-        cov=np.tile(SIGMA**2 * np.eye(3), (n, 1, 1)),
-        late=np.zeros((n, 3)),
-    )
-    forward = transform(keyframe_T_robot, np.array([1.0, 0.0, 0.0])) - keyframe_T_robot[:, :3, 3]
-    headings = Headings(k, forward, yaw_of(placed.map_T_robot), np.full(n, SIGMA_YAW))
-    return replace(problem, start=start, fixes=fixes, headings=headings, datum=topo.datum)

@@ -1,0 +1,230 @@
+"""The one loop: associate <-> solve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from topograph.estimate import Estimate, Link, Problem, graph, path_at
+from topograph.geometry import Array, inverse, transform
+from topograph.mapping.config import MappingConfig
+from topograph.trees import (
+    AtKeyframes,
+    Existence,
+    LoopCloser,
+    Shapes,
+    TrackTable,
+    exists,
+    gather,
+    moved_pose,
+    refine,
+    relevelled,
+    shapes,
+    tabulate,
+)
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Decided:
+    """Tree (N,) of each detection, the problem of the trees that exist with their own axes, what was decided of them, their
+    shapes, and how many do not exist.
+    """
+
+    tree: NDArray[np.int64]
+    problem: Problem
+    existence: Existence
+    shapes: Shapes
+    rejected: int
+
+
+class Association:
+    """The state of associate <-> solve: tracks, their trees, and the problem that follows from them."""
+
+    def __init__(self, problem: Problem, track: NDArray[np.int64], config: MappingConfig) -> None:
+        self.problem, self.config = problem, config
+        self.track = track
+        self.seen = AtKeyframes.of(problem.detections, problem.stamps_ns, problem.motion)
+        self.tracks = int(self.track.max(initial=-1)) + 1
+        self.known = len(problem.known.p) if problem.known is not None else 0
+        self.closer = LoopCloser(self.tracks + self.known, problem.motion.gyro, config.trees, config.motion)
+        self.tree_of_track = self.closer.tree
+
+    def poses(self, e: Estimate) -> Array:
+        """map_T_scan (S, 4, 4)."""
+        return path_at(e.stamps_ns, e.map_T_robot, self.problem.motion, self.problem.detections.stamps_ns)
+
+    def table(self, e: Estimate) -> TrackTable:
+        """Tracks in the map as estimated; trees of an earlier map are tracks seen long ago."""
+        d = self.problem.detections
+        t = tabulate(d, self.track, self.poses(e), self.problem.motion.distance_at(d.stamps_ns))
+        k = self.problem.known
+        if k is None:
+            return t
+        long_ago = np.full(self.known, -1e9)
+        return TrackTable(
+            place=np.concatenate([t.place, k.p[:, :2]]),
+            foot=np.concatenate([t.foot, k.p[:, :2]]),
+            width=np.concatenate([t.width, np.zeros(self.known)]),
+            post=np.concatenate([t.post, np.zeros(self.known)]),
+            sigma=np.concatenate([t.sigma, np.sqrt(0.5 * (k.cov[:, 0, 0] + k.cov[:, 1, 1]))]),
+            first=np.concatenate([t.first, long_ago]),
+            last=np.concatenate([t.last, long_ago]),
+            hits=np.concatenate([t.hits, np.full(self.known, 1000)]),
+        )
+
+    def solve(self, e: Estimate, *, least: int = 3, patient: bool = False, link: Link | None = None) -> Estimate:
+        """An estimate without covariances of the trees as they are now; `patient`: until it has converged."""
+        if link is not None:  # pull the loop shut with the trees as they were, then join them
+            e = graph.solve(
+                replace(self.problem, start=e.map_T_robot, link=link),
+                self.config.estimate,
+                quick=True,
+                patient=True,
+            )
+        self.problem, _, _ = self.with_trees(self.tree_of_track, least)
+        self.problem = replace(self.problem, start=e.map_T_robot)
+        return graph.solve(self.problem, self.config.estimate, quick=True, patient=patient)
+
+    def named(self, tree: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The trees of the tracks, called by the first of their tracks, or by the known tree that they are: a name lasts from pass to
+        pass, whatever joins it later.
+        """
+        index = np.unique(tree, return_inverse=True)[1]
+        order = np.roll(
+            np.arange(len(tree)), self.known
+        )  # known trees come last among the tracks, and first among the names
+        first = np.full(int(index.max(initial=-1)) + 1, len(tree))
+        np.minimum.at(first, index, order)
+        return np.asarray(np.argsort(order)[first[index]])
+
+    def decide(self, e: Estimate) -> Decided:
+        """What there is, given an estimate."""
+        c, d = self.config.trees, self.problem.detections
+        t = self.table(e)
+        self.tree_of_track = self.named(refine(t, self.tree_of_track, c))
+        map_T_scan = self.poses(e)
+        _, tree, ids = self.with_trees(self.tree_of_track, 1)
+        seen = transform(map_T_scan[d.scan], d.p)
+        count = np.maximum(np.bincount(tree, minlength=len(ids)), 1)
+        places = np.stack([np.bincount(tree, seen[:, k], minlength=len(ids)) / count for k in range(3)], axis=1)
+        found = exists(d, tree, map_T_scan, places, c)
+        keep = np.zeros(int(self.tree_of_track.max(initial=-1)) + 1, bool)
+        keep[ids[found.ok]] = True
+        if self.problem.known is not None:  # what the map knows exists, however rarely this run saw it
+            keep[self.tree_of_track[self.tracks :]] = True
+        problem, tree, final = self.with_trees(self.tree_of_track, 1, keep)
+        # A known map states its trees at one height, whatever their stems.
+        whole = None if problem.known is None else problem.known.tree[problem.known.tree >= 0]
+        shape = shapes(d, tree, map_T_scan, len(final), whole)
+        own = relevelled(d, tree, map_T_scan, shape)
+        sightings = gather(own, tree, problem.stamps_ns, problem.motion)
+        problem = replace(problem, start=e.map_T_robot, detections=own, sightings=sightings)
+        return Decided(tree, problem, found.select(np.searchsorted(ids, final)), shape, int((~found.ok).sum()))
+
+    def with_trees(
+        self, tree_of_track: NDArray[np.int64], least: int, keep: NDArray[np.bool_] | None = None
+    ) -> tuple[Problem, NDArray[np.int64], NDArray[np.int64]]:
+        """Problem, tree (N,) of each detection and former name (T,) of each tree, for trees of `least` detections."""
+        tree = tree_of_track[self.track]
+        size = int(tree_of_track.max(initial=-1)) + 1
+        hits = np.bincount(tree, minlength=size)
+        exists_ = hits >= max(least, 1)
+        if keep is not None:
+            exists_ &= keep
+        ids = np.flatnonzero(exists_)
+        name = np.full(size, -1, np.int64)
+        name[ids] = np.arange(len(ids))
+        tree = name[tree]
+        p = self.problem
+        known = None if p.known is None else replace(p.known, tree=name[tree_of_track[self.tracks :]])
+        return replace(p, sightings=self.seen.gather(tree), n_trees=len(ids), tree_ids=ids, known=known), tree, ids
+
+
+def associate_and_solve(
+    problem: Problem, track: NDArray[np.int64], config: MappingConfig, progress: Progress
+) -> tuple[Decided, Estimate, int]:
+    d = problem.detections
+    estimate = graph.solve(problem, config.estimate, quick=True)
+    if not len(d):
+        problem = replace(problem, start=estimate.map_T_robot)
+        none = np.zeros(0, np.int64)
+        nothing = exists(d, none, np.zeros((0, 4, 4)), np.zeros((0, 3)), config.trees)
+        empty = Decided(none, problem, nothing, shapes(d, none, np.zeros((0, 4, 4)), 0), 0)
+        return empty, replace(graph.solve(problem, config.estimate), tree=none), 0
+    a = Association(problem, track, config)
+    end = float(problem.motion.distance[-1])
+    cap = _gnss_cap(problem, a.closer)
+    while a.closer.advance(a.table(estimate), end, cap):
+        progress("associate", min(1.0, a.closer.at / max(end, 1e-9)))
+        a.tree_of_track = a.closer.tree
+        estimate = a.solve(estimate, link=_link(problem, estimate, a.closer))
+    progress("associate", 1.0)
+    a.tree_of_track = a.named(a.closer.tree)
+    estimate = a.solve(estimate, patient=True)
+    for n, patience in enumerate((4.0, 2.0, 1.0)):
+        progress("refine", n / 3)
+        before = a.tree_of_track
+        a.tree_of_track = a.named(refine(a.table(estimate), before, config.trees, patience))
+        if not np.array_equal(a.tree_of_track, before):
+            estimate = a.solve(estimate, patient=True)
+    progress("solve", 0.0)
+    after = a.decide(estimate)
+    for n in range(LAST_ROUNDS):
+        decided = after
+        estimate = replace(graph.solve(decided.problem, config.estimate), tree=decided.tree)
+        progress("solve", (n + 1) / LAST_ROUNDS)
+        after = a.decide(estimate)
+        if _settled(after, decided):
+            turned = np.abs(after.shapes.slope - decided.shapes.slope).max(initial=0.0)
+            decided = replace(decided, shapes=after.shapes)  # as the last path has them
+            if turned < SETTLED:
+                break
+    progress("solve", 1.0)
+    return decided, estimate, a.closer.loops
+
+
+FLIPS = 1e-4
+"""Share of the detections that may go to and fro between two trees: nothing moves by them."""
+
+
+def _settled(after: Decided, before: Decided) -> bool:
+    """The same trees, made of the same detections."""
+    if not np.array_equal(after.problem.tree_ids, before.problem.tree_ids):
+        return False
+    flips = int((after.tree != before.tree).sum())
+    return flips <= FLIPS * len(after.tree) and np.array_equal(after.shapes.forked, before.shapes.forked)
+
+
+LAST_ROUNDS = 4
+"""Association and solve go on until neither changes, the last solve included; at most so often."""
+SETTLED = 0.01
+"""Slopes of trees that change by less between two solves do not change what was solved, m/m."""
+
+
+def _link(problem: Problem, estimate: Estimate, closer: LoopCloser) -> Link | None:
+    """The loop just closed as one relative pose: it pulls the path over distances at which robust losses let go."""
+    if closer.link is None:
+        return None
+    before, now, centre, move = closer.link
+    distance = problem.motion.distance_at(problem.stamps_ns)
+    a, b = (int(np.clip(np.searchsorted(distance, d), 0, len(distance) - 1)) for d in (before, now))
+    if a == b:
+        return None
+    poses = estimate.map_T_robot
+    return Link(a, b, inverse(poses[a]) @ moved_pose(poses[b], centre, move))
+
+
+def _gnss_cap(problem: Problem, closer: LoopCloser) -> float:
+    """How far the path may be off where GNSS holds it, m: a few of its deviations, and the drift of its longest gap."""
+    f = problem.fixes
+    if len(f.keyframe) < 3:
+        return float("inf")
+    at = problem.motion.distance_at(problem.stamps_ns)
+    edges = np.concatenate([[at[0]], at[f.keyframe], [at[-1]]])
+    sigma = float(np.sqrt(np.median(f.cov[:, 0, 0])))
+    return max(0.5, 4.0 * sigma) + closer.drift(0.5 * float(np.diff(edges).max()))[0]

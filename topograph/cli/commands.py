@@ -94,9 +94,16 @@ def map_command(
             solved = pipeline.solve_run(
                 run, config, check_fixes=check_fixes, known=old, placed=placed, progress=progress
             )
-            topo, verdict = _save_results(solved, config, inputs, bags, folder, target, true, old, progress, accept)
+            topo, verdict = save_results(solved, config, inputs, bags, folder, target, true, old, progress, accept)
+    say_verdict(solved, topo, verdict, folder, target, run.notes)
+
+
+def say_verdict(solved: Any, topo: Any, verdict: Any, folder: Path, target: Path, notes: Sequence[str]) -> None:
+    """What became of a map, and the exit code that it deserves."""
+    from topograph import pipeline
+
     no_trees = pipeline.why_no_trees(solved)
-    for note in run.notes:
+    for note in notes:
         click.echo(f"note: {note}", err=True)
     if no_trees:
         click.echo(f"topograph: {no_trees}; the path is in {folder / 'path.tum'}", err=True)
@@ -119,7 +126,7 @@ def map_command(
     )
 
 
-def _save_results(
+def save_results(
     solved: Any, config: Any, hashes: Callable[[], list[dict[str, str]]], bags: Sequence[Path], folder: Path, target: Path, true: Any, old: Any,
     progress: Callable[[str, float], None], accept: Sequence[str] = (),
 ) -> Any:  # fmt: skip
@@ -408,7 +415,7 @@ def demo(context: click.Context, folder: Path, seed: int, quiet: bool) -> None:
         with hashed([bag]) as inputs:
             run = pipeline.read_run([bag], config, progress)
             solved = pipeline.solve_run(run, config, progress=progress)
-            topo, _ = _save_results(
+            topo, _ = save_results(
                 solved, config, inputs, [bag], folder, folder / "orchard.gpkg", truth, None, progress
             )
         record(

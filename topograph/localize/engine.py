@@ -198,10 +198,17 @@ class Engine:
         if h.submap.filter.run > 3.0 * self.config.forget and h.posterior.unknown > 0.5:
             self.hunt = _Hunt(Submap(self.config, self.visibility))
 
+    def begin_at(self, pose: Array, cov: Array) -> None:
+        """Track from a pose (3,) x, y, yaw in the map that somebody else is sure of, with its covariance (3, 3)."""
+        f = Filter()
+        f.mean[:], f.cov[:] = pose, cov
+        self._tracked(f, self.config.risk)
+
     def _commit(self) -> Filter:
-        h = self.hunt
-        self.track = anchored(h, self.index, self.config)
-        self.risk = h.posterior.risk
+        return self._tracked(anchored(self.hunt, self.index, self.config), self.hunt.posterior.risk)
+
+    def _tracked(self, track: Filter, risk: float) -> Filter:
+        self.track, self.risk = track, risk
         self.graph = None
         if self.config.estimator == "graph":
             f, var = self.track, self.index.var + self.config.map_sigma**2

@@ -138,6 +138,16 @@ class GraphMethod:
             build_index(xy, var, t.diameter, self.config.view, self.config.pair, self.config.map_sigma), self.config
         )
 
+    def begin_at(self, map_T_robot: Array, cov: Array, trunks: Trunks) -> None:
+        """Track from a pose (4, 4) that somebody else is sure of, with the covariance (3, 3) of its x, y and yaw; `trunks` say at
+        which height this front end states them.
+        """
+        self.engine = self._begin(trunks)
+        self.engine.begin_at(np.array([*map_T_robot[:2, 3], yaw_of(map_T_robot)]), cov)
+        self._tilt[:] = map_T_robot[2, 3], 0.0, 0.0
+        tilt = 0.02**2
+        self._tilt_cov[:] = np.diag([0.1**2, tilt, tilt])
+
     def step(self, trunks: Trunks, leg: Leg) -> Report:
         """One scan further."""
         if self.engine is None:

@@ -2,6 +2,7 @@
 
 from topograph.mapping.config import MappingConfig
 from topograph.mapping.known import KnownMap, Placed
+from topograph.mapping.mapper import Mapper
 from topograph.mapping.solve import Solved, map_T_scans, solve_session
 
-__all__ = ["KnownMap", "MappingConfig", "Placed", "Solved", "map_T_scans", "solve_session"]
+__all__ = ["KnownMap", "Mapper", "MappingConfig", "Placed", "Solved", "map_T_scans", "solve_session"]

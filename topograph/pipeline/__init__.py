@@ -15,11 +15,13 @@ from topograph.pipeline.mapping import (
 )
 from topograph.pipeline.placing import place
 from topograph.pipeline.read import read_run, scan_near
+from topograph.pipeline.replaying import Played, live_metrics, play
 
 __all__ = [
     "LEAST_FIXES",
     "Inspection",
     "Placed",
+    "Played",
     "Replay",
     "Role",
     "Solved",
@@ -27,9 +29,11 @@ __all__ = [
     "baseline",
     "extend",
     "inspect_bags",
+    "live_metrics",
     "localize_bags",
     "map_T_scans",
     "place",
+    "play",
     "read_run",
     "residual_metrics",
     "scan_near",

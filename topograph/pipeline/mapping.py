@@ -41,12 +41,12 @@ def why_no_trees(solved: Solved) -> str:
     return f"no trunks: none of {solved.run.scans} scans showed a tree often enough to be mapped"
 
 
-def topo_map(solved: Solved, config: Config, meta: dict[str, str]) -> TopoMap:
-    """The map of a solved run."""
+def topo_map(solved: Solved, config: Config, meta: dict[str, str], *, clouds: bool = True) -> TopoMap:
+    """The map of a solved run, with its viewpoint clouds or without."""
     return build(
         solved.estimate,
         solved.detections,
-        in_order(solved.run.trunks),
+        in_order(solved.run.trunks) if clouds else [],
         map_T_scans(solved),
         solved.existence,
         solved.shapes,

@@ -59,7 +59,7 @@ def place(topo: TopoMap, session: Session, config: Config, progress: Progress = 
         if n % 100 == 0:
             progress("place", n / len(session.trunks))
     progress("place", 1.0)
-    kept = _spread(np.array(poses).reshape(-1, 4, 4))
+    kept = spread(np.array(poses).reshape(-1, 4, 4))
     if len(kept) < LEAST:
         why = "several places fit it" if "ambiguous" in states else "no place fits it well enough"
         raise InsufficientDataError(
@@ -88,7 +88,7 @@ def _messages(session: Session) -> Iterator[Odometry | Imu]:
         yield Imu(int(s.imu_ns[j]), imu, s.gyro[j], s.accel[j])
 
 
-def _spread(poses: Array) -> NDArray[np.int64]:
+def spread(poses: Array) -> NDArray[np.int64]:
     """Rows of poses (F, 4, 4) that are at least `APART` from the one before."""
     kept: list[int] = []
     for k, p in enumerate(poses[:, :2, 3]):

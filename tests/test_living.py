@@ -1,0 +1,108 @@
+"""A run as it is driven: poses on the way, the map at the end, GNSS that comes late, a map that was there before."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from topograph.bags import Fix, Heading, Recording, Trunks
+from topograph.config import Config
+from topograph.evaluate import Truth
+from topograph.evaluate.metrics import tree_errors
+from topograph.geometry import inverse
+from topograph.mapping import Mapper
+from topograph.motion import Reckoner
+from topograph.pipeline import extend, live_metrics, play, read_run, solve_run, topo_map
+from topograph.pipeline.living import Live, State, mapping_config
+from topograph.pipeline.read import stream
+from topograph.simulate import DriveConfig, SensorConfig, record
+from topograph.topomap import TopoMap
+
+SEED = 66
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("live")
+    record(out / "run1.bag", SEED, "olive", DriveConfig(longest_s=45.0), SensorConfig(detections=True))
+    record(
+        out / "run2.bag", SEED, "olive", DriveConfig(run=2, longest_s=45.0), SensorConfig(detections=True, gnss="none")
+    )
+    return out
+
+
+@pytest.fixture(scope="module")
+def batch(folder: Path) -> TopoMap:
+    return topo_map(solve_run(read_run([folder / "run1.bag"], Config()), Config()), Config(), {})
+
+
+def metrics(folder: Path, **words: float) -> dict[str, float]:
+    played = play([folder / "run1.bag"], Config(), **words)
+    return {m.name: m.value for m in live_metrics(played, Truth.load(folder / "run1.truth"))}
+
+
+def test_poses_on_the_way_are_right_and_the_map_is_that_of_the_recording(folder: Path, batch: TopoMap) -> None:
+    played = play([folder / "run1.bag"], Config())
+    assert played.solved is not None
+    m = {x.name: x.value for x in live_metrics(played, Truth.load(folder / "run1.truth"))}
+    assert m["live: scans with a pose"] > 0.85
+    assert m["live: position error mean"] < 0.05
+    assert m["live: position error 99 %"] < 0.2
+    topo = topo_map(played.solved, Config(), {})
+    assert len(topo) == len(batch)
+    assert np.linalg.norm(topo.p - batch.p, axis=1).max() < 1e-6
+    assert [s.state for s in played.states][0] == "starting"
+    assert played.states[-1].state == "mapping"
+
+
+def test_solves_beside_the_driving_hold_no_scan_up(folder: Path) -> None:
+    """At twenty times its pace, solves come late and rarely; poses are still there, and right."""
+    m = metrics(folder, speed=20.0)
+    assert m["live: scans with a pose"] > 0.3
+    assert m["live: position error mean"] < 0.3
+
+
+def test_gnss_that_comes_late_moves_the_map_into_its_frame(folder: Path, batch: TopoMap) -> None:
+    config = Config()
+    states: list[State] = []
+    with Recording([folder / "run1.bag"], config.bags) as recording:
+        frames = recording.frames
+        mapper = Mapper(mapping_config(config), frames.find, frames.of)
+        live = Live(mapper, config, Reckoner(None, frames.get("imu_link")[:3, :3]))
+        heard = []
+        for m in stream(recording, config):
+            if isinstance(m, Trunks):
+                states.append(live.process(m, heard))
+                heard = []
+            elif not isinstance(m, (Fix, Heading)) or m.stamp_ns > recording.start_ns + 20 * 10**9:
+                heard.append(m)
+        solved, _ = live.finish()
+    before = [s for s in states if s.solved_ns and s.stamp_ns < recording.start_ns + 18 * 10**9]
+    assert before
+    assert not any(s.georeferenced for s in before)
+    assert states[-1].georeferenced
+    topo = topo_map(solved, config, {}, clouds=False)
+    assert topo.datum is not None
+    ours, _, error = tree_errors(topo, Truth.load(folder / "run1.truth"))
+    assert len(ours) == len(topo)
+    assert np.linalg.norm(error[:, :2], axis=1).mean() < 0.05
+    assert len(topo) == len(batch)
+
+
+def test_with_a_map_it_localizes_and_adds_what_is_new(folder: Path, batch: TopoMap) -> None:
+    played = play([folder / "run2.bag"], Config(), batch)
+    assert played.solved is not None
+    both = extend(batch, topo_map(played.solved, Config(), {}), played.solved, Config())
+    assert len(both) > len(batch)
+    truth = Truth.load(folder / "run2.truth")
+    ours, _, error = tree_errors(both, truth)
+    assert len(ours) == len(both)
+    assert np.linalg.norm(error[:, :2], axis=1).max() < 0.1
+    told = [s for s in played.states if s.map_T_robot is not None]
+    assert len(told) > 0.8 * len(played.states)
+    # Where it was told to be on the way is where the whole run puts it.
+    e = played.solved.estimate
+    last = told[-1]
+    assert last.map_T_robot is not None
+    apart = (inverse(e.map_T_robot[-1]) @ last.map_T_robot)[:2, 3]
+    assert np.linalg.norm(apart) < 0.6  # one keyframe

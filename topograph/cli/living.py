@@ -1,0 +1,89 @@
+"""`topograph live`."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from topograph.cli.commands import save_results, say_verdict
+from topograph.cli.common import config_of, hashed, input_options, main, progress_bar, results_folder, table, truth_of
+from topograph.errors import UsageError
+
+
+@main.command()
+@click.argument("bags", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="BAG... [MAP]")
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), help="The map file (.gpkg) that is written at the end."
+)
+@click.option("--force", is_flag=True, help="Replace the map file of -o if it is there.")
+@click.option("--speed", type=click.FloatRange(0.0), default=0.0, show_default=True,
+              help="Times the recording's own pace; 0: as fast as it goes.")  # fmt: skip
+@click.option("--every", type=click.FloatRange(0.0), default=1.0, show_default=True,
+              help="Say what is known every so many seconds of the recording.")  # fmt: skip
+@click.option("--accept", multiple=True, metavar="NAME", help="Save the map though the audit refuses it for NAME.")
+@click.option("--from", "from_s", type=float, default=0.0, help="Begin so many seconds into the recording.")
+@click.option("--to", "to_s", type=float, default=float("inf"), help="End there.")
+@click.option("--results", type=click.Path(path_type=Path), help="Folder for path, report and configuration.")
+@click.option("--truth", type=click.Path(path_type=Path), help="Folder of simulated truth to compare with.")
+@click.option("-q", "--quiet", is_flag=True, help="Say nothing on the way.")
+@input_options
+def live(
+    bags: tuple[Path, ...], output: Path | None, force: bool, speed: float, every: float, accept: tuple[str, ...], from_s: float,
+    to_s: float, results: Path | None, truth: Path | None, quiet: bool, config_file: Path | None, **words: Any,
+) -> None:  # fmt: skip
+    """Play BAG as if it were driven now: without a MAP (.gpkg) it maps, with one it localizes in it and extends it at the end.
+
+    One line a second says where the robot is and which trees there are. GNSS is taken in when it comes.
+    """
+    from topograph import pipeline, store
+
+    maps = [b for b in bags if b.suffix == ".gpkg"]
+    paths = tuple(b for b in bags if b.suffix != ".gpkg")
+    if len(maps) > 1 or not paths:
+        raise UsageError("give one run's BAGs, and at most one MAP (.gpkg) to localize in")
+    if not 0.0 <= from_s < to_s:
+        raise UsageError(f"--from {from_s} --to {to_s}: nothing lies between")
+    if output is not None and output.suffix != ".gpkg":
+        raise UsageError(f"{output}: a map is a GeoPackage; end its name in .gpkg")
+    if output is not None and output.exists() and not force:
+        raise UsageError(f"{output}: is there already; --force replaces it")
+    config, true = config_of(config_file, words), truth_of(truth)
+    old = store.load(maps[0]) if maps else None
+    said = [-np.inf]
+
+    def say(s: Any) -> None:
+        now = s.stamp_ns * 1e-9
+        if quiet or now - said[0] < every:
+            return
+        said[0] = now
+        click.echo(line(s))
+
+    with ExitStack() as stack:
+        folder = stack.enter_context(results_folder(results))
+        target = output or folder / "map.gpkg"
+        stack.enter_context(store.locked(target))
+        inputs = stack.enter_context(hashed(paths))
+        played = pipeline.play(paths, config, old, speed=speed, say=say, span_s=(from_s, to_s))
+        assert played.solved is not None
+        with progress_bar(quiet=True) as progress:
+            topo, verdict = save_results(
+                played.solved, config, inputs, paths, folder, target, true, old, progress, accept
+            )
+    table(pipeline.live_metrics(played, true))
+    say_verdict(played.solved, topo, verdict, folder, target, [*played.notes, *played.solved.run.notes])
+
+
+def line(s: Any) -> str:
+    """One line of what is known."""
+    clock = f"{s.stamp_ns // 10**9}.{s.stamp_ns % 10**9 // 10**8}"
+    trees = f"{s.trees} trees" if s.solved_ns or s.trees else "no trees yet"
+    if s.map_T_robot is None:
+        return f"{clock}  {s.state:<9} no pose; {trees}"
+    x, y = s.map_T_robot[:2, 3]
+    yaw = np.degrees(np.arctan2(s.map_T_robot[1, 0], s.map_T_robot[0, 0]))
+    frame = "ENU" if s.georeferenced else "local"
+    return f"{clock}  {s.state:<9} {x:8.2f} {y:8.2f} m ± {100 * s.sigma:.0f} cm  {yaw:6.1f}°  {frame}; {trees}"

@@ -1,0 +1,105 @@
+"""A run while it is driven: what came so far, and the solve of it."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from topograph.bags import Fix, Heading, Imu, Odometry, Trunks
+from topograph.errors import InsufficientDataError
+from topograph.geometry import Array, inverse
+from topograph.mapping.config import MappingConfig
+from topograph.mapping.known import KnownMap, Placed
+from topograph.mapping.solve import Solved, solve_session
+from topograph.session import Session, StreamsBuilder
+
+FIRST_S = 5.0
+"""Before so much was recorded there is no map worth the name."""
+DUTY = 4.0
+"""Between two solves lies so many times what the last one took: mapping costs a quarter of a core, however long the run."""
+
+
+class Mapper:
+    """Feed it scans and messages as they come; `solve` makes path and trees of all that came, as `map` does of a recording.
+
+    Args:
+        find: frame of a sensor -> its mounting (4, 4), or None where nobody knows.
+        mount: `Recording.frames.of`: kind and frame -> its mounting, or None.
+
+    Attributes:
+        took: CPU seconds of the last solve.
+    """
+
+    def __init__(
+        self,
+        config: MappingConfig,
+        find: Callable[[str], Array | None],
+        mount: Callable[[str, str], Array | None],
+        chosen: dict[str, str] | None = None,
+    ) -> None:
+        self.config, self.chosen = config, chosen or {}
+        self._find, self._mount = find, mount
+        self._builder = StreamsBuilder()
+        self._trunks: list[Trunks] = []
+        self.skipped: Counter[str] = Counter()
+        self.took = 0.0
+        self._start_ns: int | None = None
+        self._solved_ns: int | None = None
+
+    def __len__(self) -> int:
+        return len(self._trunks)
+
+    def process(self, trunks: Trunks, messages: Iterable[Odometry | Imu | Fix | Heading] = ()) -> bool:
+        """One scan's trunks in `base_link`, and the messages since the last; whether it is time to solve."""
+        for m in messages:
+            self._builder.add(m)
+        self._trunks.append(trunks)
+        now = trunks.stamp_ns
+        if self._start_ns is None:
+            self._start_ns = now
+        since = (now - (self._start_ns if self._solved_ns is None else self._solved_ns)) * 1e-9
+        return since >= max(FIRST_S, DUTY * self.took)
+
+    def session(self) -> Session:
+        """What came so far."""
+        skipped = Counter(self.skipped)
+        streams = self._builder.build(skipped)
+        mounts: dict[str, Array | None] = {
+            k: self._mount(k, streams.frames[k]) for k in ("imu", "fix", "heading") if k in streams.frames
+        }
+        child = self._find(streams.frames.get("child", ""))
+        trunks = list(self._trunks)
+        span = (trunks[-1].stamp_ns - trunks[0].stamp_ns) * 1e-9 if trunks else 0.0
+        return Session(
+            streams=streams,
+            trunks=trunks,
+            mounts=mounts,
+            child_T_robot=np.eye(4) if child is None else inverse(child),
+            chosen=self.chosen,
+            skipped=skipped,
+            notes=[],
+            scans=len(trunks),
+            seconds=0.0,
+            duration_s=span,
+            start_ns=self._start_ns or 0,
+        )
+
+    def begin(self) -> None:
+        """A solve of what came so far begins, here or elsewhere."""
+        self._solved_ns = self._trunks[-1].stamp_ns
+
+    def solve(self, known: KnownMap | None = None, placed: Placed | None = None) -> Solved | None:
+        """Path and trees of what came so far; None while that does not determine them."""
+        if not self._trunks:
+            return None
+        self.begin()
+        began = time.process_time()
+        try:
+            return solve_session(self.session(), self.config, known=known, placed=placed)
+        except InsufficientDataError:
+            return None
+        finally:
+            self.took = time.process_time() - began

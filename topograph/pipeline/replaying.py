@@ -1,0 +1,122 @@
+"""A bag, played through `Live` as if it were driven now."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from topograph.bags import Fix, Heading, Imu, Odometry, Recording, Trunks
+from topograph.config import Config
+from topograph.errors import InsufficientDataError
+from topograph.evaluate import Metric, Truth
+from topograph.geometry import interpolate
+from topograph.mapping import KnownMap, Mapper, Solved
+from topograph.motion import Reckoner
+from topograph.pipeline.living import Live, State, mapping_config
+from topograph.pipeline.read import WHOLE, Progress, child_mount, refuse_damaged, silent, stream
+from topograph.topomap import TopoMap
+
+
+@dataclass(slots=True)
+class Played:
+    """A run that was played live: its states, and what it ended with."""
+
+    states: list[State] = field(default_factory=list)
+    solved: Solved | None = None
+    known: KnownMap | None = None
+    notes: list[str] = field(default_factory=list)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def play(
+    paths: Sequence[Path],
+    config: Config,
+    topo: TopoMap | None = None,
+    *,
+    speed: float = 0.0,
+    say: Callable[[State], None] = lambda _: None,
+    progress: Progress = silent,
+    span_s: tuple[float, float] = WHOLE,
+) -> Played:
+    """Play bags at `speed` times the recording's own pace (0: as fast as it goes), and `say` what is known after each scan.
+
+    Raises:
+        InsufficientDataError: no scan, or a run that does not determine its path.
+    """
+    out = Played()
+    began = time.perf_counter()
+    with Recording(paths, config.bags) as recording:
+        live: Live | None = None
+        heard: list[Odometry | Imu | Fix | Heading] = []
+        first_ns = 0
+        for m in stream(recording, config, progress, span_s):
+            if not isinstance(m, Trunks):
+                heard.append(m)
+                continue
+            if live is None:
+                live, first_ns = _begin(recording, heard, config, topo, out.notes, speed > 0), m.stamp_ns
+            if speed > 0:
+                ahead = (m.stamp_ns - first_ns) * 1e-9 / speed - (time.perf_counter() - began)
+                time.sleep(max(ahead, 0.0))
+            state = live.process(m, heard)
+            heard = []
+            out.states.append(state)
+            say(state)
+        refuse_damaged(recording)
+        if live is None:
+            raise InsufficientDataError("no scan in the recording (or in the part that was asked for)")
+        live.mapper.skipped.update(recording.skipped)
+        out.notes += [*recording.notes, *recording.clocks.notes]
+    out.seconds["play"] = time.perf_counter() - began
+    progress("finish", 0.0)
+    began = time.perf_counter()
+    out.solved, out.known = live.finish()
+    out.seconds["finish"] = time.perf_counter() - began
+    progress("finish", 1.0)
+    return out
+
+
+def _begin(
+    recording: Recording,
+    heard: Sequence[Odometry | Imu | Fix | Heading],
+    config: Config,
+    topo: TopoMap | None,
+    notes: list[str],
+    background: bool,
+) -> Live:
+    """A `Live` with the mountings that the recording knows."""
+    child = next((m.child_frame for m in heard if isinstance(m, Odometry)), config.bags.base_frame)
+    imu = next((m.frame for m in heard if isinstance(m, Imu)), None)
+    mount = None if imu is None else recording.frames.find(imu)
+    mapper = Mapper(mapping_config(config), recording.frames.find, recording.frames.of, dict(recording.chosen))
+    child_T_robot = child_mount(recording, child, config, notes)
+    reckoner = Reckoner(child_T_robot, None if mount is None else mount[:3, :3])
+    return Live(mapper, config, reckoner, topo, background=background)
+
+
+def live_metrics(played: Played, truth: Truth | None) -> list[Metric]:
+    """What it took, and how far the poses were off as they were told."""
+    states = played.states
+    ms = 1e3 * np.array([s.seconds for s in states])
+    span = (states[-1].stamp_ns - states[0].stamp_ns) * 1e-9
+    told = [s for s in states if s.map_T_robot is not None]
+    out = [
+        Metric("live: scans with a pose", len(told) / len(states), "", "higher"),
+        Metric("live: a scan, 99 %", float(np.percentile(ms, 99)), "ms", "lower"),
+        Metric("live: solves' share of a core", sum(s.solve_s for s in states) / max(span, 1e-9), "", "lower"),
+    ]
+    placed = [s for s in told if s.georeferenced]
+    if truth is None or not placed or played.solved is None or played.solved.problem.datum is None:
+        return out
+    datum = played.solved.problem.datum
+    true = interpolate(truth.stamps_ns, truth.world_T_robot, np.array([s.stamp_ns for s in placed], np.int64))
+    at = datum.to_enu(truth.datum.to_geodetic(true[:, :3, 3]))
+    found = np.array([s.map_T_robot[:3, 3] for s in placed if s.map_T_robot is not None])
+    off = np.linalg.norm((found - at)[:, :2], axis=1)
+    out.append(Metric("live: position error mean", float(off.mean()), "m", "lower"))
+    out.append(Metric("live: position error 99 %", float(np.percentile(off, 99)), "m", "lower"))
+    return out

@@ -51,7 +51,7 @@ def test_poses_on_the_way_are_right_and_the_map_is_that_of_the_recording(folder:
     topo = topo_map(played.solved, Config(), {})
     assert len(topo) == len(batch)
     assert np.linalg.norm(topo.p - batch.p, axis=1).max() < 1e-6
-    assert [s.state for s in played.states][0] == "starting"
+    assert played.states[0].state == "starting"
     assert played.states[-1].state == "mapping"
 
 

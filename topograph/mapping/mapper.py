@@ -52,10 +52,14 @@ class Mapper:
     def __len__(self) -> int:
         return len(self._trunks)
 
-    def process(self, trunks: Trunks, messages: Iterable[Odometry | Imu | Fix | Heading] = ()) -> bool:
-        """One scan's trunks in `base_link`, and the messages since the last; whether it is time to solve."""
+    def hear(self, messages: Iterable[Odometry | Imu | Fix | Heading]) -> None:
+        """Messages without a scan."""
         for m in messages:
             self._builder.add(m)
+
+    def process(self, trunks: Trunks, messages: Iterable[Odometry | Imu | Fix | Heading] = ()) -> bool:
+        """One scan's trunks in `base_link`, and the messages since the last; whether it is time to solve."""
+        self.hear(messages)
         self._trunks.append(trunks)
         now = trunks.stamp_ns
         if self._start_ns is None:

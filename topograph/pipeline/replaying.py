@@ -69,6 +69,7 @@ def play(
         refuse_damaged(recording)
         if live is None:
             raise InsufficientDataError("no scan in the recording (or in the part that was asked for)")
+        live.mapper.hear(heard)
         live.mapper.skipped.update(recording.skipped)
         out.notes += [*recording.notes, *recording.clocks.notes]
     out.seconds["play"] = time.perf_counter() - began

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from topograph.audit.verdict import Finding
-from topograph.estimate import Estimate, Problem
+from topograph.estimate import Estimate, Problem, path_at
 from topograph.estimate.initial import heading_misfit
 from topograph.geometry import Array, inverse, transform, yaw_of
 from topograph.motion import Motion
@@ -45,6 +45,8 @@ DRIFT = (0.05, 6.0)
 JUMP, JUMP_FIXES, JUMP_S = (0.33, 8.0), 8, 6.0
 """A step of the fixes against dead reckoning, m and stated deviations, between the medians of so many fixes before and after it, all within
 so many seconds (clean: up to 0.21 m, in tight turns)."""
+OUTVOTED = 0.25
+"""Share of the fixes that three quarters which agree with wheels, trunks and each other outvote."""
 JUMP_WIDE = 0.3
 """Of the step: how far the fixes of one side may lie apart."""
 REFUSING = ("moving",)
@@ -129,19 +131,28 @@ def jumps(problem: Problem, estimate: Estimate, streams: Streams, lever: Array) 
 
     Over a few seconds dead reckoning is good to centimetres; a solve may bend a whole run to take in half a metre.
     """
-    n, motion = len(streams.fix_ns), problem.motion
-    if n < 4 * JUMP_FIXES or len(problem.stamps_ns) < 2:
+    motion = problem.motion
+    if not motion.wheels or problem.datum is None or len(problem.stamps_ns) < 2:
         return
-    at = motion.at(streams.fix_ns)
-    nearest = np.clip(np.searchsorted(problem.stamps_ns, streams.fix_ns), 0, len(problem.stamps_ns) - 1)
+    covered = (streams.fix_ns >= motion.stamps_ns[0]) & (streams.fix_ns <= motion.stamps_ns[-1])
+    fix_ns, n = streams.fix_ns[covered], int(covered.sum())
+    if n < 4 * JUMP_FIXES:
+        return
+    at = motion.at(fix_ns)
+    nearest = np.clip(np.searchsorted(problem.stamps_ns, fix_ns), 0, len(problem.stamps_ns) - 1)
     yaw = yaw_of(estimate.map_T_robot[nearest]) - yaw_of(motion.at(problem.stamps_ns[nearest]))
     told = transform(at, np.broadcast_to(lever, (n, 3)))[:, :2]
     c, s = np.cos(yaw), np.sin(yaw)
-    fix, sigma = streams.fixes_enu()[:, :2], streams.fix_sigma()
+    enu, sigma = problem.datum.to_enu(streams.lat_lon_h[covered]), streams.fix_sigma()[covered]
+    fix = enu[:, :2]
+    poses = path_at(estimate.stamps_ns, estimate.map_T_robot, motion, fix_ns)
+    off = np.linalg.norm((transform(poses, np.broadcast_to(lever, (n, 3))) - enu)[:, :2], axis=1)
+    refused = off > np.maximum(AWAY[0], AWAY[1] * sigma)
+    outvoted = refused.mean() < OUTVOTED
     worst, when, most = 0.0, 0.0, 1.0
     for i in range(JUMP_FIXES, n - JUMP_FIXES):
         mine = slice(i - JUMP_FIXES, i + JUMP_FIXES)
-        if streams.fix_ns[i + JUMP_FIXES - 1] - streams.fix_ns[i - JUMP_FIXES] > JUMP_S * 1e9:
+        if fix_ns[i + JUMP_FIXES - 1] - fix_ns[i - JUMP_FIXES] > JUMP_S * 1e9:
             continue
         way = told[mine] - told[i]
         turned = np.column_stack([c[i] * way[:, 0] - s[i] * way[:, 1], s[i] * way[:, 0] + c[i] * way[:, 1]])
@@ -151,15 +162,35 @@ def jumps(problem: Problem, estimate: Estimate, streams: Streams, lever: Array) 
         wide = np.hypot(*(left - np.repeat(sides, JUMP_FIXES, axis=0)).T).reshape(2, -1)
         if np.median(wide, axis=1).max() > JUMP_WIDE * step:
             continue  # scattered outliers, not two places
+        if outvoted and _left_behind(off, refused, i, step):
+            continue  # a few are elsewhere for a while, and the solve has not followed them
         bound = max(JUMP[0], JUMP[1] * float(np.median(sigma[mine])))
         if step > bound and step / bound > worst / most:
-            worst, when, most = step, (streams.fix_ns[i] - motion.stamps_ns[0]) * 1e-9, bound
+            worst, when, most = step, (fix_ns[i] - motion.stamps_ns[0]) * 1e-9, bound
     if worst > 0:
         yield Finding(
             name="fixes jump", value=worst, bound=most, unit="m",
             sentence=f"at {when:.0f} s the fixes step aside by {worst:.2f} m and stay there, while wheels and gyro go on: either side may be the "
             "right one; check the receiver's base and ambiguities",
         )  # fmt: skip
+
+
+def _left_behind(off: Array, refused: NDArray[np.bool_], i: int, step: float) -> bool:
+    """Whether one side of a step of so many m before fix `i` is refused as a whole: all the while as far from the path, `off` (n,) m, as
+    the step is. Where the path bends to it, that falls off.
+    """
+    for forward in (True, False):
+        there = refused[i:] if forward else refused[:i][::-1]
+        far = off[i:] if forward else off[:i][::-1]
+        back = np.flatnonzero(~there[SKIPPED:])
+        length = SKIPPED + int(back[0]) if len(back) else len(there)
+        if length >= JUMP_FIXES and float(np.percentile(far[SKIPPED:length], 20)) > WHOLE * step:
+            return True
+    return False
+
+
+SKIPPED, WHOLE = 5, 0.7
+"""Fixes at the step itself, which may lie on either side; share of the step that a refused side keeps from the path."""
 
 
 def standing(streams: Streams, motion: Motion) -> Iterator[Finding]:

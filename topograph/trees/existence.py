@@ -86,7 +86,8 @@ def exists(
         in_map = transform(map_T_scan[d.scan], d.p)[:, :2]
         ok &= ~parts_apart(in_map, d, tree, n, np.zeros(len(d)), STILL)
     else:
-        ok &= _shown_often(scan, which, p, seen, hits, n, config)
+        anew = _looks(map_T_scan)[scan]
+        ok &= _shown_often(scan[anew], which[anew], p[anew], seen[anew], hits, n, config)
     kind, probability = _kinds(d, tree, n)
     if (d.score[used] != 0.0).any():  # recorded detections may come without
         # Scores differ between sensors and orchards: what counts is also how this run's own trees score.
@@ -181,6 +182,17 @@ def _kinds(d: Detections, tree: NDArray[np.int64], n: int) -> tuple[NDArray[np.i
     probability = chance[np.arange(n), kind]
     probability[total == 0] = np.nan
     return kind, probability
+
+
+LOOK = 0.2
+"""Between two looks at the same place, m: what rides along stands still beside a robot that stands, however long it does."""
+
+
+def _looks(map_T_scan: Array) -> NDArray[np.bool_]:
+    """Scans (S,) that were taken from another place than the look before."""
+    way = np.linalg.norm(np.diff(map_T_scan[:, :2, 3], axis=0), axis=1)
+    at = np.floor(np.concatenate([[0.0], np.cumsum(way)]) / LOOK)
+    return np.concatenate([[True], np.diff(at) > 0])
 
 
 def _shown_often(

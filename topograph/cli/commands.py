@@ -21,6 +21,7 @@ from topograph.cli.common import (
     peak_mb,
     progress_bar,
     results_folder,
+    say_if_cold,
     table,
     truth_of,
     versions,
@@ -70,6 +71,7 @@ def map_command(
         raise UsageError(f"--accept {unknown[0]}: nothing is refused for that; known are {', '.join(REFUSING)}")
     if not 0.0 <= from_s < to_s:
         raise UsageError(f"--from {from_s} --to {to_s}: nothing lies between")
+    say_if_cold(quiet)
     config = config_of(config_file, words)
     true = truth_of(truth)
     with ExitStack() as stack:

@@ -78,6 +78,16 @@ def main(verbose: bool) -> None:
         logging.getLogger("topograph").setLevel(logging.WARNING)
 
 
+def say_if_cold(quiet: bool = False) -> None:
+    """Say so before the first run of an installation compiles: it would seem to hang."""
+    own = os.environ.get("NUMBA_CACHE_DIR")
+    folder = Path(own) if own else Path(__file__).parent.parent / "trunks"
+    if not quiet and not any(folder.rglob("fit.fit_chains*.nbi")):
+        click.echo(
+            "the first run of an installation compiles for about a minute (`topograph warm` does it ahead)", err=True
+        )
+
+
 def input_options(f: _F) -> _F:
     for kind in reversed(_TOPICS):
         f = click.option(f"--topic-{kind}", default=None, metavar="TOPIC", help=f"Topic of {kind}; 'none' ignores it.")(

@@ -97,6 +97,27 @@ def doctor() -> None:
         sys.exit(1)
 
 
+@main.command()
+def warm() -> None:
+    """Compile ahead what the first run would compile: about a minute, once after an installation."""
+    import tempfile
+    import time
+
+    from topograph import pipeline, store
+    from topograph.config import Config
+    from topograph.simulate import DriveConfig, SensorConfig, record
+
+    began = time.perf_counter()
+    config = Config()
+    with tempfile.TemporaryDirectory() as folder:
+        bag, path = Path(folder) / "run.bag", Path(folder) / "map.gpkg"
+        record(bag, 1, "grid", DriveConfig(longest_s=6.0), SensorConfig(columns=900))
+        solved = pipeline.solve_run(pipeline.read_run([bag], config), config)
+        store.save(pipeline.topo_map(solved, config, {}), path)
+        pipeline.localize_bags(store.load(path), [bag], config)
+    click.echo(f"compiled: {time.perf_counter() - began:.0f} s")
+
+
 def _front_end() -> str:
     import time
 

@@ -10,7 +10,17 @@ import click
 import numpy as np
 
 from topograph.cli.commands import save_results, say_verdict
-from topograph.cli.common import config_of, hashed, input_options, main, progress_bar, results_folder, table, truth_of
+from topograph.cli.common import (
+    config_of,
+    hashed,
+    input_options,
+    main,
+    progress_bar,
+    results_folder,
+    say_if_cold,
+    table,
+    truth_of,
+)
 from topograph.errors import UsageError
 
 
@@ -52,6 +62,7 @@ def live(
     if output is not None and output.exists() and not force:
         raise UsageError(f"{output}: is there already; --force replaces it")
     config, true = config_of(config_file, words), truth_of(truth)
+    say_if_cold(quiet)
     old = store.load(maps[0]) if maps else None
     said = [-np.inf]
 

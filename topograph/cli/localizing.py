@@ -19,6 +19,7 @@ from topograph.cli.common import (
     peak_mb,
     progress_bar,
     results_folder,
+    say_if_cold,
     table,
     truth_of,
     versions,
@@ -62,6 +63,7 @@ def localize(
         config = replace(config, localize=replace(config.localize, risk=risk))
     if measure is not None:
         config = replace(config, localize=replace(config.localize, measure=measure))
+    say_if_cold(quiet)
     true = truth_of(truth)
     topo = store.load(map_file, clouds=method != "graph")
     if true is not None and topo.datum is None:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from topograph import store
 from topograph.config import Config
+from topograph.errors import MapError
 from topograph.pipeline import extend, read_run, solve_run, topo_map
 from topograph.simulate import DriveConfig, SensorConfig, record
 from topograph.topomap import Seen, SessionRecord, TopoMap
@@ -92,6 +93,22 @@ def test_maps_without_sessions_are_read(two_sessions: tuple[TopoMap, TopoMap], t
     assert old.session.tolist() == [0] * len(one.stamps_ns)
 
 
+def test_a_map_that_somebody_took_a_tree_out_of_can_be_repaired(
+    two_sessions: tuple[TopoMap, TopoMap], tmp_path: Path
+) -> None:
+    _, both = two_sessions
+    store.save(both, tmp_path / "m.gpkg")
+    gone = int(both.ids[2])
+    with sqlite3.connect(tmp_path / "m.gpkg") as c:
+        c.execute("DELETE FROM trees WHERE id = ?", (gone,))
+    with pytest.raises(MapError):
+        store.load(tmp_path / "m.gpkg")
+    got = store.load(tmp_path / "m.gpkg", check=False)
+    assert gone not in got.ids
+    assert len(got) == len(both) - 1
+    assert len(got.seen) == len(both.seen) - int((both.seen.tree == 2).sum())
+
+
 def _seen(*rows: tuple[int, int, int, int]) -> Seen:
     tree, session, count, passed = np.array(rows, np.int64).reshape(-1, 4).T
     return Seen(tree=tree, session=session, count=count, first_ns=count, last_ns=count, passed=passed)
@@ -100,6 +117,8 @@ def _seen(*rows: tuple[int, int, int, int]) -> Seen:
 def test_the_last_session_that_looked_decides() -> None:
     gone = _seen((0, 0, 9, 0), (0, 1, 0, MOST_PASSED), (1, 0, 9, 0), (1, 1, 0, MOST_PASSED - 1))
     assert gone.states(2) == [MISSING, STANDING]
+    stray = gone.and_(_seen((0, 2, 1, 40)))
+    assert stray.states(2) == [MISSING, STANDING]
     back = gone.and_(_seen((0, 2, 3, 0)))
     assert back.states(2) == [STANDING, STANDING]
     assert gone.moved(np.array([-1, 0]), 0).states(1) == [STANDING]

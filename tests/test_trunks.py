@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from topograph.bags import Recording, Scan
+from topograph.bags import Odometry, Recording, Scan
 from topograph.config import Config
 from topograph.evaluate import Truth, trunk_metrics
 from topograph.geometry import exp
@@ -15,6 +15,7 @@ from topograph.trunks import ThesisTrunksConfig, TrunksConfig, fit
 from topograph.trunks.detector import Detector, candidates
 from topograph.trunks.features import FEATURES
 from topograph.trunks.fit import AXIS_Z, OUT_SIZE, X, suppress, vertical
+from topograph.trunks.frontend import FrontEnd
 from topograph.trunks.organise import rings_of
 from topograph.trunks.runs import COUNT, PX, PY, PZ, RUN_SIZE
 from topograph.trunks.score import KIND_PRIOR, kinds, network
@@ -283,3 +284,16 @@ def test_covariances_lie_along_the_line_of_sight(bearing: float) -> None:
     cov = fit.covariances(fits, np.array([[1.5, 2.0]]))[0, :2, :2]
     assert np.sqrt(line @ cov @ line) == pytest.approx(0.3, rel=1e-3)
     assert np.sqrt(side @ cov @ side) == pytest.approx(0.02, rel=1e-2)
+
+
+@pytest.mark.parametrize("value", [1e39, 1e200, 1e20, np.nan, np.inf])
+def test_a_broken_wheel_message_costs_itself(value: float) -> None:
+    """Beyond what single precision holds: a point that is no number must not be looked up anywhere."""
+    front_end = FrontEnd(lambda _: MOUNT, lambda _: None)
+    scan = cylinder_scene(16, 5.0, 1.0, 0.3)
+    front_end.hear(Odometry(scan.stamp_ns, "base_link", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.full(6, value)))
+    found = front_end.see(scan)
+    assert np.isfinite(found.p).all()
+    assert len(found) > 0
+    still = Detector(MOUNT, TrunksConfig())(scan, np.zeros(6))
+    assert len(Detector(MOUNT, TrunksConfig())(scan, np.full(6, value))) == len(still)

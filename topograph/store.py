@@ -340,7 +340,14 @@ def load(path: Path | str, *, clouds: bool = True, check: bool = True) -> TopoMa
         cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 0] = v[:, 4], v[:, 5], v[:, 5]
         cov[:, 1, 1], cov[:, 2, 2] = v[:, 6], v[:, 7]
         place = {int(i): k for k, i in enumerate(ids)}
-        edges = np.array([(place[a], place[b]) for a, b in c.execute("SELECT a, b FROM edges ORDER BY id")], np.int64)
+        edges = np.array(
+            [
+                (place[a], place[b])
+                for a, b in c.execute("SELECT a, b FROM edges ORDER BY id")
+                if check or {a, b} <= place.keys()
+            ],
+            np.int64,
+        )
         path_rows = np.array(
             c.execute("SELECT x, y, z, qx, qy, qz, qw FROM path ORDER BY id").fetchall(), float
         ).reshape(-1, 7)
@@ -348,9 +355,13 @@ def load(path: Path | str, *, clouds: bool = True, check: bool = True) -> TopoMa
         told = _has(c, "viewpoints", "session")
         views: tuple[Viewpoint, ...] = ()
         if clouds:
-            views = tuple(_viewpoint(path, place, r) for r in c.execute(_VIEWS.format("session" if told else "1")))
+            views = tuple(
+                _viewpoint(path, place, r)
+                for r in c.execute(_VIEWS.format("session" if told else "1"))
+                if check or r[0] in place
+            )
         sightings = v[:, 13].astype(np.int64)
-        sessions, session, seen = _sessions(c, place, stamps, sightings)
+        sessions, session, seen = _sessions(c, place, stamps, sightings, check)
         datum = Datum(*(float(x) for x in meta["datum"].split(","))) if meta.get("datum") else None
         edges = edges.reshape(-1, 2)
         p = v[:, 1:4]
@@ -384,7 +395,7 @@ def load(path: Path | str, *, clouds: bool = True, check: bool = True) -> TopoMa
 
 
 def _sessions(
-    c: sqlite3.Connection, place: dict[int, int], stamps: NDArray[np.int64], sightings: NDArray[np.int64]
+    c: sqlite3.Connection, place: dict[int, int], stamps: NDArray[np.int64], sightings: NDArray[np.int64], check: bool
 ) -> tuple[tuple[SessionRecord, ...], NDArray[np.int64], Seen]:
     """The sessions of a map, the one of each of its poses, and what they saw; a map that was written before they were kept has one."""
     if not _has(c, "sessions", "name"):
@@ -409,6 +420,7 @@ def _sessions(
         [
             (place[r[0]], *r[1:])
             for r in c.execute("SELECT tree, session, count, first_ns, last_ns, passed FROM sightings ORDER BY id")
+            if check or (r[0] in place and 0 < r[1] <= len(records))  # somebody may have taken trees out
         ],
         np.int64,
     ).reshape(-1, 6)

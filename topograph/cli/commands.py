@@ -14,6 +14,8 @@ import numpy as np
 
 from topograph import __version__
 from topograph.cli.common import (
+    check_accepted,
+    check_target,
     config_of,
     hashed,
     input_options,
@@ -62,13 +64,10 @@ def map_command(
 ) -> None:  # fmt: skip
     """Make a map of the trees in BAGS (one run)."""
     from topograph import pipeline, store
-    from topograph.audit import REFUSING
 
     if output is not None and into is not None:
         raise UsageError("-o makes a new map, --into extends one: give one of them")
-    unknown = sorted(set(accept) - set(REFUSING))
-    if unknown:
-        raise UsageError(f"--accept {unknown[0]}: nothing is refused for that; known are {', '.join(REFUSING)}")
+    check_accepted(accept)
     if not 0.0 <= from_s < to_s:
         raise UsageError(f"--from {from_s} --to {to_s}: nothing lies between")
     say_if_cold(quiet)
@@ -77,10 +76,7 @@ def map_command(
     with ExitStack() as stack:
         folder = stack.enter_context(results_folder(results))
         target = into or output or folder / "map.gpkg"
-        if target.suffix != ".gpkg":
-            raise UsageError(f"{target}: a map is a GeoPackage; end its name in .gpkg")
-        if target.is_dir():
-            raise UsageError(f"{target}: is a folder; name a file that ends in .gpkg")
+        check_target(target)
         if output is not None and output.exists() and not force:
             raise UsageError(f"{output}: is there already; --force replaces it, --into {output} extends it")
         if into is not None and not into.exists():
@@ -91,8 +87,10 @@ def map_command(
         with progress_bar(quiet) as progress:
             run = pipeline.read_run(bags, config, progress, (from_s, to_s), jobs)
             placed = None
-            if old is not None and (old.datum is None or len(run.streams.fix_ns) < pipeline.LEAST_FIXES):
-                placed = pipeline.place(old, run, config, progress)
+            if old is not None:
+                pipeline.refuse_twice(old, run)
+                if pipeline.has_no_common_gnss(old, run):
+                    placed = pipeline.place(old, run, config, progress)
             solved = pipeline.solve_run(
                 run, config, check_fixes=check_fixes, known=old, placed=placed, progress=progress
             )

@@ -78,6 +78,21 @@ def main(verbose: bool) -> None:
         logging.getLogger("topograph").setLevel(logging.WARNING)
 
 
+def check_accepted(accept: Sequence[str]) -> None:
+    from topograph.audit import REFUSING
+
+    unknown = sorted(set(accept) - set(REFUSING))
+    if unknown:
+        raise UsageError(f"--accept {unknown[0]}: nothing is refused for that; known are {', '.join(REFUSING)}")
+
+
+def check_target(target: Path) -> None:
+    if target.suffix != ".gpkg":
+        raise UsageError(f"{target}: a map is a GeoPackage; end its name in .gpkg")
+    if target.is_dir():
+        raise UsageError(f"{target}: is a folder; name a file that ends in .gpkg")
+
+
 def say_if_cold(quiet: bool = False) -> None:
     """Say so before the first run of an installation compiles: it would seem to hang."""
     own = os.environ.get("NUMBA_CACHE_DIR")

@@ -11,6 +11,8 @@ import numpy as np
 
 from topograph.cli.commands import save_results, say_verdict
 from topograph.cli.common import (
+    check_accepted,
+    check_target,
     config_of,
     hashed,
     input_options,
@@ -45,7 +47,8 @@ def live(
     bags: tuple[Path, ...], output: Path | None, force: bool, speed: float, every: float, accept: tuple[str, ...], from_s: float,
     to_s: float, results: Path | None, truth: Path | None, quiet: bool, config_file: Path | None, **words: Any,
 ) -> None:  # fmt: skip
-    """Play BAG as if it were driven now: without a MAP (.gpkg) it maps, with one it localizes in it and extends it at the end.
+    """Play BAG as if it were driven now: without a MAP (.gpkg) it maps, with one it localizes in it. At the end the map, of this run or
+    of MAP with this run in it, is written to -o; MAP itself stays as it is. Ctrl-C ends the drive there, and the map is made.
 
     One line a second says where the robot is and which trees there are. GNSS is taken in when it comes.
     """
@@ -57,13 +60,11 @@ def live(
         raise UsageError("give one run's BAGs, and at most one MAP (.gpkg) to localize in")
     if not 0.0 <= from_s < to_s:
         raise UsageError(f"--from {from_s} --to {to_s}: nothing lies between")
-    if output is not None and output.suffix != ".gpkg":
-        raise UsageError(f"{output}: a map is a GeoPackage; end its name in .gpkg")
+    check_accepted(accept)
     if output is not None and output.exists() and not force:
         raise UsageError(f"{output}: is there already; --force replaces it")
     config, true = config_of(config_file, words), truth_of(truth)
     say_if_cold(quiet)
-    old = store.load(maps[0]) if maps else None
     said = [-np.inf]
 
     def say(s: Any) -> None:
@@ -76,7 +77,9 @@ def live(
     with ExitStack() as stack:
         folder = stack.enter_context(results_folder(results))
         target = output or folder / "map.gpkg"
+        check_target(target)
         stack.enter_context(store.locked(target))
+        old = store.load(maps[0]) if maps else None
         inputs = stack.enter_context(hashed(paths))
         played = pipeline.play(paths, config, old, speed=speed, say=say, span_s=(from_s, to_s))
         assert played.solved is not None

@@ -28,7 +28,7 @@ class EstimateConfig:
         learn_scale: rescale trunk and GNSS noise by their residuals.
         most_sightings, quick_sightings: of one keyframe that are used, the surest first: where a hundred trunks are in
             view, the far ones add errors of their own kind and no information.
-        iterations: most Levenberg-Marquardt steps of a pass.
+        iterations: most steps of a pass.
         d_max: of the thesis's Algorithm 3, m.
     """
 
@@ -111,6 +111,7 @@ class Problem:
         detections: all trunks, for the estimator that associates for itself.
         sightings: associated trunks.
         n_trees: number of trees in `sightings`.
+        placed: the fixes and headings are places in a known map that the localizer found, no GNSS.
         tree_ids: (n_trees,) what each is called from pass to pass: the first of its tracks, or the known tree that it is. The graph's
             keys are made of it.
         pose_sigma: when the path is known beforehand (`start`), its deviation (m, rad); else None.
@@ -139,6 +140,7 @@ class Problem:
     up: Array | None = None
     up_sigma: Array | None = None
     link: Link | None = None
+    placed: bool = False
     tree_ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
 
     def names(self) -> NDArray[np.int64]:

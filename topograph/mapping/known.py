@@ -11,6 +11,9 @@ from topograph.geometry import Array, Datum, Stamps, inverse, transform, yaw_of
 from topograph.trees import Detections
 from topograph.trees.sightings import nearest_keyframe
 
+UNKNOWN = 1.0
+"""Variance of a tree whose covariance nobody knows, m²."""
+
 
 @dataclass(frozen=True, slots=True)
 class KnownMap:
@@ -26,7 +29,8 @@ class KnownMap:
         above = detections.height[np.isfinite(detections.height)]
         height = float(np.median(above)) if len(above) else 0.0
         p = self.p + self.axis * (height / np.maximum(self.axis[:, 2:], 0.3))
-        cov = np.where(np.isfinite(self.cov), self.cov, 0.0)
+        unknown = np.isnan(self.cov.sum(axis=(1, 2)))
+        cov = np.where(unknown.reshape(-1, 1, 1), UNKNOWN * np.eye(3), self.cov)
         cov[:, [0, 1, 2], [0, 1, 2]] = np.maximum(cov[:, [0, 1, 2], [0, 1, 2]], 1e-5)
         return KnownTrees(p, cov, np.full(len(p), -1, np.int64))
 
@@ -63,4 +67,4 @@ def put(problem: Problem, placed: Placed, datum: Datum | None) -> Problem:
     )
     forward = transform(keyframe_T_robot, np.array([1.0, 0.0, 0.0])) - keyframe_T_robot[:, :3, 3]
     headings = Headings(k, forward, yaw_of(placed.map_T_robot), np.full(n, SIGMA_YAW))
-    return replace(problem, start=start, fixes=fixes, headings=headings, datum=datum)
+    return replace(problem, start=start, fixes=fixes, headings=headings, datum=datum, placed=True)

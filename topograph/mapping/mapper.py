@@ -10,11 +10,11 @@ import numpy as np
 
 from topograph.bags import Fix, Heading, Imu, Odometry, Trunks
 from topograph.errors import InsufficientDataError
-from topograph.geometry import Array, inverse
+from topograph.geometry import Array, Datum, inverse
 from topograph.mapping.config import MappingConfig
 from topograph.mapping.known import KnownMap, Placed
 from topograph.mapping.solve import Solved, solve_session
-from topograph.session import Session, StreamsBuilder
+from topograph.session import Session, StreamsBuilder, unknown_mounts
 
 FIRST_S = 5.0
 """Before so much was recorded there is no map worth the name."""
@@ -28,9 +28,11 @@ class Mapper:
     Args:
         find: frame of a sensor -> its mounting (4, 4), or None where nobody knows.
         mount: `Recording.frames.of`: kind and frame -> its mounting, or None.
+        start_ns: when the recording began; the first scan's stamp where nobody says.
 
     Attributes:
         took: CPU seconds of the last solve.
+        datum: of the first map with GNSS: later ones on the way keep to it, so that a place has one pair of coordinates.
     """
 
     def __init__(
@@ -39,14 +41,16 @@ class Mapper:
         find: Callable[[str], Array | None],
         mount: Callable[[str, str], Array | None],
         chosen: dict[str, str] | None = None,
+        start_ns: int | None = None,
     ) -> None:
         self.config, self.chosen = config, chosen or {}
+        self.datum: Datum | None = None
         self._find, self._mount = find, mount
         self._builder = StreamsBuilder()
         self._trunks: list[Trunks] = []
         self.skipped: Counter[str] = Counter()
         self.took = 0.0
-        self._start_ns: int | None = None
+        self._start_ns = start_ns
         self._solved_ns: int | None = None
 
     def __len__(self) -> int:
@@ -84,7 +88,7 @@ class Mapper:
             child_T_robot=np.eye(4) if child is None else inverse(child),
             chosen=self.chosen,
             skipped=skipped,
-            notes=[],
+            notes=unknown_mounts(streams, mounts),
             scans=len(trunks),
             seconds=0.0,
             duration_s=span,
@@ -95,15 +99,25 @@ class Mapper:
         """A solve of what came so far begins, here or elsewhere."""
         self._solved_ns = self._trunks[-1].stamp_ns
 
-    def solve(self, known: KnownMap | None = None, placed: Placed | None = None) -> Solved | None:
+    def solve(self) -> Solved | None:
         """Path and trees of what came so far; None while that does not determine them."""
         if not self._trunks:
             return None
         self.begin()
         began = time.process_time()
         try:
-            return solve_session(self.session(), self.config, known=known, placed=placed)
+            solved = solve_session(self.session(), self.config, datum=self.datum)
         except InsufficientDataError:
             return None
         finally:
             self.took = time.process_time() - began
+        self.datum = self.datum or solved.problem.datum
+        return solved
+
+    def finish(self, session: Session, known: KnownMap | None = None, placed: Placed | None = None) -> Solved:
+        """As `map` solves a recording: into the `known` map, if there is one.
+
+        Raises:
+            InsufficientDataError: what came does not determine the path.
+        """
+        return solve_session(session, self.config, known=known, placed=placed)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from topograph.errors import InsufficientDataError
 from topograph.estimate import Estimate, Problem, path_at
 from topograph.estimate.assemble import assemble, choose_datum, without_wrong_headings
-from topograph.geometry import Array
+from topograph.geometry import Array, Datum
 from topograph.mapping.association import Progress, associate_and_solve
 from topograph.mapping.config import MappingConfig
 from topograph.mapping.known import KnownMap, Placed, put
@@ -62,12 +62,13 @@ def solve_session(
     check_fixes: int = 0,
     known: KnownMap | None = None,
     placed: Placed | None = None,
+    datum: Datum | None = None,
     progress: Progress = silent,
 ) -> Solved:
     """Associate and solve. Every `check_fixes`-th fix is withheld from the estimator and kept for checking.
 
     With a `known` map the run is put into its frame, by GNSS or where it was `placed` in it, and its trees are landmarks with
-    their covariances.
+    their covariances. A `datum` that is given is kept to, where there are fixes.
 
     Raises:
         InsufficientDataError: neither motion nor fixes; or a known map and no common frame.
@@ -100,7 +101,8 @@ def solve_session(
         used[check_fixes - 1 :: check_fixes] = False
     if check_fixes == 1:
         used[:] = False
-    datum = choose_datum(run.streams, used)
+    found = choose_datum(run.streams, used)
+    datum = found if datum is None or found is None else datum
     if known is not None and placed is None:
         if known.datum is None or datum is None:
             raise InsufficientDataError(

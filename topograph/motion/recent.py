@@ -20,6 +20,8 @@ LEAST = 20
 G = 9.80665
 IN_G = 2.0
 """An accelerometer whose mean is below this speaks in g, m/s²."""
+MOST = 1000.0
+"""A value beyond is of a broken message, in whatever unit: it is passed over here, and counted where streams are read."""
 ROWS = 8192
 """Messages that are kept, at least: two seconds of the fastest sensors."""
 
@@ -64,8 +66,9 @@ class RecentMotion:
     def add(self, message: Odometry | Imu) -> None:
         """One message; older ones than came before are welcome."""
         if isinstance(message, Imu):
-            self._imu.add(message.stamp_ns, message.gyro, message.accel)
-        else:
+            if np.abs(message.gyro).max() < MOST and np.abs(message.accel).max() < MOST:  # False for NaN
+                self._imu.add(message.stamp_ns, message.gyro, message.accel)
+        elif np.abs(message.twist).max() < MOST:
             self._wheels.add(message.stamp_ns, message.twist)
 
     def twist(self, start_ns: int, end_ns: int) -> tuple[Array, str]:

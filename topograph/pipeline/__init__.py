@@ -1,6 +1,5 @@
 """Straight lines: bags to a map, a map and bags to poses."""
 
-from topograph.estimate.assemble import LEAST_FIXES
 from topograph.mapping import Placed, Solved, map_T_scans
 from topograph.pipeline.auditing import audited
 from topograph.pipeline.inspecting import Inspection, Role, inspect_bags
@@ -13,12 +12,11 @@ from topograph.pipeline.mapping import (
     topo_map,
     why_no_trees,
 )
-from topograph.pipeline.placing import place
+from topograph.pipeline.placing import has_no_common_gnss, place, refuse_twice
 from topograph.pipeline.read import read_run, scan_near
 from topograph.pipeline.replaying import Played, live_metrics, play
 
 __all__ = [
-    "LEAST_FIXES",
     "Inspection",
     "Placed",
     "Played",
@@ -28,6 +26,7 @@ __all__ = [
     "audited",
     "baseline",
     "extend",
+    "has_no_common_gnss",
     "inspect_bags",
     "live_metrics",
     "localize_bags",
@@ -35,6 +34,7 @@ __all__ = [
     "place",
     "play",
     "read_run",
+    "refuse_twice",
     "residual_metrics",
     "scan_near",
     "solve_run",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from topograph import audit
@@ -16,15 +18,21 @@ def audited(solved: Solved) -> Verdict:
     """Whether to believe it."""
     p, e = solved.problem, solved.estimate
     found = [
-        *audit.offsets(p, e),
-        *audit.fixes(p, e),
-        *audit.jumps(p, e, solved.streams, _lever(solved)),
-        *audit.standing(solved.streams, solved.motion),
-        *audit.headings(p, e),
+        *(f for f in audit.offsets(p, e) if not p.placed or f.name not in ("fix clock", "antenna")),
+        *(() if p.placed else _of_gnss(solved)),
         *audit.trunks(p, e, solved.moving, solved.existence.kind == TREE),
         *_mounts(solved),
     ]
     return Verdict(tuple(sorted(found, key=lambda f: (not f.refuses, -f.value / f.bound))))
+
+
+def _of_gnss(solved: Solved) -> Iterator[Finding]:
+    """What fixes and headings say; places in a map that the localizer found are none."""
+    p, e = solved.problem, solved.estimate
+    yield from audit.fixes(p, e)
+    yield from audit.jumps(p, e, solved.streams, _lever(solved))
+    yield from audit.standing(solved.streams, solved.motion)
+    yield from audit.headings(p, e)
 
 
 TURNED = np.radians(45.0)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
+import signal
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -13,18 +17,16 @@ import numpy as np
 from topograph.bags import Fix, Heading, Imu, Odometry, Trunks
 from topograph.config import Config
 from topograph.errors import InsufficientDataError
-from topograph.geometry import Array, inverse, planar
+from topograph.geometry import Array, Datum, inverse, planar
 from topograph.localize import GraphMethod, Localizer
 from topograph.mapping import KnownMap, Mapper, MappingConfig, Placed, Solved
 from topograph.motion import Reckoner
 from topograph.pipeline.mapping import topo_map
-from topograph.pipeline.placing import spread
+from topograph.pipeline.placing import LEAST, has_no_common_gnss, refuse_twice, spread
 from topograph.topomap import TopoMap
 
 DRIFT, DRIFT_YAW = 0.03, 0.01
 """What dead reckoning may be off by since the last solve: share of the way, and rad per metre."""
-LEAST = 3
-"""Trees of a map that a robot can be tracked on."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,7 +38,7 @@ class State:
         map_T_robot: (4, 4), or None; `sigma` the larger horizontal deviation, m.
         trees: of the map as it is now.
         solved_ns: stamp of the scan at which the map was last renewed, 0 never.
-        georeferenced: the map's frame is ENU.
+        datum: of the map's frame, ENU there; None: the frame is local.
         seconds: what this scan took, without a solve; `solve_s` what the solve took, 0 without one.
     """
 
@@ -46,9 +48,14 @@ class State:
     sigma: float
     trees: int
     solved_ns: int
-    georeferenced: bool
+    datum: Datum | None
     seconds: float
     solve_s: float
+
+    @property
+    def georeferenced(self) -> bool:
+        """The frame is ENU."""
+        return self.datum is not None
 
 
 class Live:
@@ -72,7 +79,6 @@ class Live:
         self._solving: _Solving | None = None
         self._solved_ns = 0
         self.topo = topo
-        self.solved: Solved | None = None
         self._reckoner = reckoner
         self._localizer = None if topo is None else Localizer(topo, config.localize)
         if self._localizer is not None:
@@ -92,7 +98,9 @@ class Live:
         solve_s = 0.0
         if self._solving is not None and self._solving.poll():
             found, self._solving = self._solving.result(), None
-            self.mapper.took = self.mapper.took if found is None else found.took
+            if found is not None:
+                self.mapper.took = found.took
+                self.mapper.datum = self.mapper.datum or found.topo.datum
             solve_s = self.mapper.took
             self._renew(trunks, found)
         elif due and self.old is None and self._solving is None:
@@ -111,7 +119,7 @@ class Live:
             sigma=sigma,
             trees=0 if self.topo is None else int(self.topo.is_tree.sum()),
             solved_ns=self._solved_ns,
-            georeferenced=self.topo is not None and self.topo.datum is not None,
+            datum=None if self.topo is None else self.topo.datum,
             seconds=seconds,
             solve_s=solve_s,
         )
@@ -123,24 +131,21 @@ class Live:
             InsufficientDataError: the run does not determine its path, or was never found in the map.
         """
         if self._solving is not None:
-            self._solving.result()
+            self._solving.stop()
             self._solving = None
         known, placed = None, None
+        session = self.mapper.session()
         if self.old is not None:
+            refuse_twice(self.old, session)
+            known = KnownMap(self.old.p, self.old.cov, self.old.axis, self.old.datum)
+        if self.old is not None and has_no_common_gnss(self.old, session):
             poses = np.array([p for _, p in self._placed]).reshape(-1, 4, 4)
             kept = spread(poses)
             if len(kept) < LEAST:
                 raise InsufficientDataError("the run was not found in the map often enough to extend it")
             stamps = np.array([ns for ns, _ in self._placed], np.int64)
             placed = Placed(stamps[kept], poses[kept])
-            known = KnownMap(self.old.p, self.old.cov, self.old.axis, self.old.datum)
-        solved = self.mapper.solve(known, placed)
-        if solved is None:
-            raise InsufficientDataError(
-                "the run does not determine its path: no wheels and no fixes, or too few of them"
-            )
-        self.solved = solved
-        return solved, known
+        return self.mapper.finish(session, known, placed), known
 
     # -- where the robot is ---------------------------------------------------------------------------------------
 
@@ -220,6 +225,20 @@ def _renewed(mapper: Mapper, config: Config) -> _Renewed | None:
     return _Renewed(topo, int(e.stamps_ns[-1]), e.map_T_robot[-1], mapper.took)
 
 
+PR_SET_PDEATHSIG = 1
+"""Of prctl(2)."""
+
+
+def _alone(keep: int) -> None:
+    """In a child: give back all that is open but one file and the standard ones (the lock of a map dies with its process), and end when
+    the parent does.
+    """
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL("libc.so.6").prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    os.closerange(3, keep)
+    os.closerange(keep + 1, 4096)
+
+
 class _Solving:
     """A solve beside the driving: a child of this process, which has all that came until now, and whose map comes back."""
 
@@ -232,6 +251,7 @@ class _Solving:
 
     @staticmethod
     def _work(back: Connection, mapper: Mapper, config: Config) -> None:
+        _alone(back.fileno())
         back.send(_renewed(mapper, config))
         back.close()
 
@@ -239,10 +259,18 @@ class _Solving:
         """Whether it is done."""
         return self._result.poll() or not self._process.is_alive()
 
+    def stop(self) -> None:
+        """Nobody wants it any more."""
+        self._process.kill()
+        self._process.join()
+        self._result.close()
+
     def result(self) -> _Renewed | None:
         """What it found; None where that did not determine the path, or the child died."""
         try:
-            found = self._result.recv() if self._result.poll() else None
+            found = (
+                self._result.recv()
+            )  # before joining: a child that writes more than a pipe holds waits for its reader
         except EOFError:
             found = None
         self._process.join()

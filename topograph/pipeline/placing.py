@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from topograph.bags import Imu, Odometry
 from topograph.config import Config
-from topograph.errors import InsufficientDataError
+from topograph.errors import InsufficientDataError, UsageError
+from topograph.estimate.assemble import LEAST_FIXES
 from topograph.geometry import Array, to_quaternion
 from topograph.localize import Localizer
 from topograph.mapping import Placed
@@ -67,6 +68,23 @@ def place(topo: TopoMap, session: Session, config: Config, progress: Progress = 
             "what the map knows"
         )
     return Placed(np.array(stamps, np.int64)[kept], np.array(poses)[kept])
+
+
+def has_no_common_gnss(topo: TopoMap, session: Session) -> bool:
+    """Whether a run can be put into a map by its trees alone."""
+    return topo.datum is None or len(session.streams.fix_ns) < LEAST_FIXES
+
+
+def refuse_twice(topo: TopoMap, session: Session) -> None:
+    """The same recording says nothing new.
+
+    Raises:
+        UsageError: it is in the map already.
+    """
+    if session.id in {s.name for s in topo.sessions}:
+        raise UsageError(
+            f"this recording is in the map already (session {session.id}): it would only seem to make it surer"
+        )
 
 
 AHEAD_NS = 100_000_000

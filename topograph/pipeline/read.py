@@ -19,7 +19,7 @@ from topograph.bags import DAMAGED, UNDECODED, Fix, Heading, Imu, Odometry, Reco
 from topograph.config import Config
 from topograph.errors import InputError
 from topograph.geometry import Array, inverse
-from topograph.session import Session, Streams, StreamsBuilder
+from topograph.session import Session, Streams, StreamsBuilder, unknown_mounts
 from topograph.trunks import from_recorded
 
 if TYPE_CHECKING:
@@ -133,12 +133,7 @@ def read_run(
         mounts: dict[str, Array | None] = {
             k: recording.frames.of(k, streams.frames[k]) for k in ("imu", "fix", "heading") if k in streams.frames
         }
-        for k, name in (("fix", "antenna"), ("heading", "heading")):
-            if k in mounts and mounts[k] is None:
-                notes.append(
-                    f"{name} frame {streams.frames[k]!r} is not in TF: taken at the base; "
-                    f"add --extrinsic {streams.frames[k]}=X,Y,Z,ROLL,PITCH,YAW"
-                )
+        notes += unknown_mounts(streams, mounts)
         if recording.untimed > UNTIMED * max(len(trunks), 1):
             notes.append(_smear(streams, trunks))
         child_T_robot = child_mount(recording, streams.frames.get("child", ""), config, notes)

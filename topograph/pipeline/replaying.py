@@ -53,19 +53,22 @@ def play(
         live: Live | None = None
         heard: list[Odometry | Imu | Fix | Heading] = []
         first_ns = 0
-        for m in stream(recording, config, progress, span_s):
-            if not isinstance(m, Trunks):
-                heard.append(m)
-                continue
-            if live is None:
-                live, first_ns = _begin(recording, heard, config, topo, out.notes, speed > 0), m.stamp_ns
-            if speed > 0:
-                ahead = (m.stamp_ns - first_ns) * 1e-9 / speed - (time.perf_counter() - began)
-                time.sleep(max(ahead, 0.0))
-            state = live.process(m, heard)
-            heard = []
-            out.states.append(state)
-            say(state)
+        try:
+            for m in stream(recording, config, progress, span_s):
+                if not isinstance(m, Trunks):
+                    heard.append(m)
+                    continue
+                if live is None:
+                    live, first_ns = _begin(recording, heard, config, topo, out.notes, speed > 0), m.stamp_ns
+                if speed > 0:
+                    ahead = (m.stamp_ns - first_ns) * 1e-9 / speed - (time.perf_counter() - began)
+                    time.sleep(max(ahead, 0.0))
+                state = live.process(m, heard)
+                heard = []
+                out.states.append(state)
+                say(state)
+        except KeyboardInterrupt:
+            out.notes.append("stopped by hand: what came until then is mapped")
         refuse_damaged(recording)
         if live is None:
             raise InsufficientDataError("no scan in the recording (or in the part that was asked for)")
@@ -93,7 +96,9 @@ def _begin(
     child = next((m.child_frame for m in heard if isinstance(m, Odometry)), config.bags.base_frame)
     imu = next((m.frame for m in heard if isinstance(m, Imu)), None)
     mount = None if imu is None else recording.frames.find(imu)
-    mapper = Mapper(mapping_config(config), recording.frames.find, recording.frames.of, dict(recording.chosen))
+    mapper = Mapper(
+        mapping_config(config), recording.frames.find, recording.frames.of, dict(recording.chosen), recording.start_ns
+    )
     child_T_robot = child_mount(recording, child, config, notes)
     reckoner = Reckoner(child_T_robot, None if mount is None else mount[:3, :3])
     return Live(mapper, config, reckoner, topo, background=background)
@@ -111,11 +116,11 @@ def live_metrics(played: Played, truth: Truth | None) -> list[Metric]:
         Metric("live: solves' share of a core", sum(s.solve_s for s in states) / max(span, 1e-9), "", "lower"),
     ]
     placed = [s for s in told if s.georeferenced]
-    if truth is None or not placed or played.solved is None or played.solved.problem.datum is None:
+    if truth is None or not placed:
         return out
-    datum = played.solved.problem.datum
     true = interpolate(truth.stamps_ns, truth.world_T_robot, np.array([s.stamp_ns for s in placed], np.int64))
-    at = datum.to_enu(truth.datum.to_geodetic(true[:, :3, 3]))
+    world = truth.datum.to_geodetic(true[:, :3, 3])
+    at = np.array([s.datum.to_enu(g[None])[0] for s, g in zip(placed, world, strict=True) if s.datum is not None])
     found = np.array([s.map_T_robot[:3, 3] for s in placed if s.map_T_robot is not None])
     off = np.linalg.norm((found - at)[:, :2], axis=1)
     out.append(Metric("live: position error mean", float(off.mean()), "m", "lower"))

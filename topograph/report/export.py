@@ -38,7 +38,7 @@ def write(topo: TopoMap, path: Path) -> None:
 def _geojson(topo: TopoMap) -> dict[str, Any]:
     if topo.datum is None:
         raise UsageError("the map is not georeferenced: GeoJSON needs longitude and latitude; export .csv instead")
-    g = topo.geodetic()
+    g, state, block, place = topo.geodetic(), topo.state, topo.block, topo.place
     trees = [
         {
             "type": "Feature",
@@ -50,6 +50,9 @@ def _geojson(topo: TopoMap) -> dict[str, Any]:
                 "row": int(topo.row[i]),
                 "kind": KINDS[int(topo.kind[i])],
                 "stems": int(topo.stems[i]),
+                "state": state[i],
+                "block": int(block[i]),
+                "place": place[i],
             },
         }
         for i in range(len(topo))
@@ -58,12 +61,12 @@ def _geojson(topo: TopoMap) -> dict[str, Any]:
 
 
 def _csv(topo: TopoMap) -> str:
-    g = topo.geodetic()
-    lines = ["id,x,y,z,lat,lon,h,diameter,sigma_x,sigma_y,sightings,row,kind,kind_probability,stems"]
+    g, state, block, place = topo.geodetic(), topo.state, topo.block, topo.place
+    lines = ["id,x,y,z,lat,lon,h,diameter,sigma_x,sigma_y,sightings,row,kind,kind_probability,stems,state,block,place"]
     for i in range(len(topo)):
         sx, sy = np.sqrt(topo.cov[i, [0, 1], [0, 1]])
         lines.append(
             f"{topo.ids[i]},{topo.p[i, 0]:.4f},{topo.p[i, 1]:.4f},{topo.p[i, 2]:.4f},{g[i, 0]:.9f},{g[i, 1]:.9f},{g[i, 2]:.4f},"
-            f"{topo.diameter[i]:.4f},{sx:.4f},{sy:.4f},{topo.sightings[i]},{topo.row[i]},{KINDS[int(topo.kind[i])]},{topo.kind_probability[i]:.3f},{topo.stems[i]}"
+            f"{topo.diameter[i]:.4f},{sx:.4f},{sy:.4f},{topo.sightings[i]},{topo.row[i]},{KINDS[int(topo.kind[i])]},{topo.kind_probability[i]:.3f},{topo.stems[i]},{state[i]},{block[i]},{place[i]}"
         )
     return "\n".join(lines) + "\n"

@@ -1,6 +1,6 @@
 """One run: what it is called, its mountings, its streams as columns. The only thing the rooms above are handed."""
 
-from topograph.session.session import Session
+from topograph.session.session import Session, unknown_mounts
 from topograph.session.streams import Streams, StreamsBuilder
 
-__all__ = ["Session", "Streams", "StreamsBuilder"]
+__all__ = ["Session", "Streams", "StreamsBuilder", "unknown_mounts"]

@@ -14,6 +14,15 @@ from topograph.geometry import Array
 from topograph.session.streams import Streams
 
 
+def unknown_mounts(streams: Streams, mounts: dict[str, Array | None]) -> list[str]:
+    """What to say of antennas whose place nobody knows."""
+    return [
+        f"{name} frame {streams.frames[k]!r} is not in TF: taken at the base; add --extrinsic {streams.frames[k]}=X,Y,Z,ROLL,PITCH,YAW"
+        for k, name in (("fix", "antenna"), ("heading", "heading"))
+        if k in mounts and mounts[k] is None
+    ]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Session:
     """What was read of a recording.

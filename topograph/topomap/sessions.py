@@ -73,8 +73,8 @@ class Seen:
         """State of each of so many trees: what the last session that looked for it says."""
         out = [STANDING] * trees
         for i in np.argsort(self.session, kind="stable").tolist():
-            if self.count[i] > 0:
-                out[int(self.tree[i])] = STANDING
-            elif self.passed[i] >= MOST_PASSED:
+            if self.passed[i] >= max(MOST_PASSED, self.count[i]):  # a stray sighting does not raise a felled tree
                 out[int(self.tree[i])] = MISSING
+            elif self.count[i] > 0:
+                out[int(self.tree[i])] = STANDING
         return out

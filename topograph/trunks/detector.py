@@ -70,7 +70,8 @@ def candidates(
     the base's frame, horizontal metres per metre of height, where it is known: else the trunks tell.
     """
     scan = once(scan)
-    twist = np.nan_to_num(twist, posinf=0.0, neginf=0.0)
+    if not (np.abs(twist) < FASTEST).all():  # False for NaN: a broken message says nothing of the sweep
+        twist = np.zeros(6)
     if len(scan.xyz) == 0:
         return _NOTHING
     R = base_T_lidar[:3, :3]
@@ -123,6 +124,8 @@ def heights_above_ground(scan: Scan, base_T_lidar: Array) -> tuple[float, float]
     return float(base_T_lidar[2, 3] - plane[0]), float(-plane[0])
 
 
+FASTEST = 100.0
+"""m/s and rad/s: what no robot does."""
 NOTHING = 1e8
 """Cells without a point are higher, m."""
 LEAST_GROUND = 20

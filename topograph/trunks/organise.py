@@ -211,11 +211,12 @@ def _lowest(q):
     px, py, pz = q[0], q[1], q[2]
     m = px.shape[0]
     cell = np.empty(m, np.int32)
-    side, zero, top = np.float32(HALF + 1), np.float32(0.0), np.float32(2 * HALF + 1)
+    side, zero, end = np.float32(HALF + 1), np.float32(0.0), np.float32(2 * HALF + 2)
     row = np.int32(2 * HALF + 2)
-    for k in range(m):  # cells of the rim are for all that is outside
-        i, j = min(max(px[k] + side, zero), top), min(max(py[k] + side, zero), top)
-        cell[k] = np.int32(i) * row + np.int32(j)
+    for k in range(m):  # the first cell, of the rim, is for all that is outside, and for what is no number
+        i, j = px[k] + side, py[k] + side
+        inside = (i >= zero) & (j >= zero) & (i < end) & (j < end)
+        cell[k] = np.int32(i) * row + np.int32(j) if inside else np.int32(0)
     low = np.full((2 * HALF + 2) * (2 * HALF + 2), np.float32(1e9))
     for k in range(m):
         c = np.uint32(cell[k])

@@ -14,6 +14,7 @@ from topograph.cli import main
 from topograph.config import Config, dump, from_dict, load
 from topograph.errors import UsageError
 from topograph.evaluate import Truth, read_tum
+from topograph.simulate import DriveConfig, SensorConfig, record
 
 T0 = 1_700_000_000_000_000_000
 
@@ -68,7 +69,12 @@ def test_map_of_a_run(tmp_path: Path, detections_run: tuple[Path, Truth]) -> Non
     for name in ("trees.geojson", "trees.csv", "path.tum"):
         assert call("export", tmp_path / "m.gpkg", tmp_path / ("x" + name)).exit_code == 0
     assert call("view", tmp_path / "m.gpkg", tmp_path / "view.html").exit_code == 0
-    again = call("map", path, "--into", tmp_path / "m.gpkg", "--results", tmp_path / "2", "-q")
+    twice = call("map", path, "--into", tmp_path / "m.gpkg", "--results", tmp_path / "2", "-q")
+    assert twice.exit_code == 2
+    assert "in the map already" in twice.output
+    second = tmp_path / "second"
+    record(second, 3, "grid", DriveConfig(run=2), SensorConfig(detections=True, compression="zstd"))
+    again = call("map", second, "--into", tmp_path / "m.gpkg", "--results", tmp_path / "2", "-q")
     assert again.exit_code == 0, again.output
     extended = store.load(tmp_path / "m.gpkg")
     assert len(extended) == len(topo)

@@ -38,7 +38,7 @@ from topograph.config import Config
 from topograph.errors import TopographError
 from topograph.pipeline import audited, inspect_bags, read_run, solve_run, topo_map
 from topograph.simulate import DriveConfig, SensorConfig, record
-from topograph.topomap import TopoMap
+from topograph.topomap import Seen, TopoMap
 
 FORMATS = ("none.bag", "lz4.bag", "none.mcap", "zstd.mcap", "rows.db3")
 LONGEST_S, LARGEST_MB = 60.0, 1500.0
@@ -163,12 +163,15 @@ def one_map(job: tuple[Path, int, int, Path]) -> Result:
     return one(source, k, np.random.default_rng([seed, k]), folder, read)
 
 
-def same(a: TopoMap, b: TopoMap) -> bool:
+def same(a: TopoMap | Seen, b: TopoMap | Seen) -> bool:
     """Every field; poses are kept as quaternions, which costs the last bit."""
-    for f in fields(TopoMap):
+    for f in fields(a):
         x, y = getattr(a, f.name), getattr(b, f.name)
         if f.name == "viewpoints":
             if len(x) != len(y) or any(not np.array_equal(p.cloud, q.cloud) for p, q in zip(x, y, strict=True)):
+                return False
+        elif isinstance(x, Seen):
+            if not same(x, y):
                 return False
         elif isinstance(x, np.ndarray):
             if x.shape != y.shape or not np.allclose(x, y, rtol=0.0, atol=1e-12, equal_nan=x.dtype.kind == "f"):

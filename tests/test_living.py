@@ -16,7 +16,8 @@ from topograph.geometry import inverse
 from topograph.mapping import Mapper
 from topograph.motion import Reckoner
 from topograph.pipeline import extend, live_metrics, play, read_run, solve_run, topo_map
-from topograph.pipeline.living import Live, State, _Renewed, _Solving, mapping_config
+from topograph.pipeline.living import Live, State, _Renewed, _Solving
+from topograph.pipeline.mapping import mapping_config
 from topograph.pipeline.read import stream
 from topograph.simulate import DriveConfig, SensorConfig, record
 from topograph.topomap import TopoMap

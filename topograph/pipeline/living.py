@@ -19,9 +19,9 @@ from topograph.config import Config
 from topograph.errors import InsufficientDataError
 from topograph.geometry import Array, Datum, inverse, planar
 from topograph.localize import GraphMethod, Localizer
-from topograph.mapping import KnownMap, Mapper, MappingConfig, Placed, Solved
+from topograph.mapping import KnownMap, Mapper, Placed, Solved
 from topograph.motion import Reckoner
-from topograph.pipeline.mapping import topo_map
+from topograph.pipeline.mapping import known_map, topo_map
 from topograph.pipeline.placing import LEAST, has_no_common_gnss, refuse_twice, spread
 from topograph.topomap import TopoMap
 
@@ -137,7 +137,7 @@ class Live:
         session = self.mapper.session()
         if self.old is not None:
             refuse_twice(self.old, session)
-            known = KnownMap(self.old.p, self.old.cov, self.old.axis, self.old.datum)
+            known = known_map(self.old)
         if self.old is not None and has_no_common_gnss(self.old, session):
             poses = np.array([p for _, p in self._placed]).reshape(-1, 4, 4)
             kept = spread(poses)
@@ -276,8 +276,3 @@ class _Solving:
         self._process.join()
         self._result.close()
         return found if isinstance(found, _Renewed) else None
-
-
-def mapping_config(config: Config) -> MappingConfig:
-    """The blocks of a configuration that the loop is told."""
-    return MappingConfig(config.motion, config.trees, config.estimate)

@@ -27,9 +27,20 @@ def solve_run(
     progress: Progress = silent,
 ) -> Solved:
     """`mapping.solve_session` with the settings of a whole run, and a map as it is stored."""
-    parts = MappingConfig(config.motion, config.trees, config.estimate)
-    old = None if known is None else KnownMap(known.p, known.cov, known.axis, known.datum)
-    return solve_session(run, parts, check_fixes=check_fixes, known=old, placed=placed, progress=progress)
+    old = None if known is None else known_map(known)
+    return solve_session(
+        run, mapping_config(config), check_fixes=check_fixes, known=old, placed=placed, progress=progress
+    )
+
+
+def mapping_config(config: Config) -> MappingConfig:
+    """The blocks of a configuration that the loop is told."""
+    return MappingConfig(config.motion, config.trees, config.estimate)
+
+
+def known_map(topo: TopoMap) -> KnownMap:
+    """What the loop needs of a map."""
+    return KnownMap(topo.p, topo.cov, topo.axis, topo.datum)
 
 
 def why_no_trees(solved: Solved) -> str:

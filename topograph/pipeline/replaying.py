@@ -16,7 +16,8 @@ from topograph.evaluate import Metric, Truth
 from topograph.geometry import interpolate
 from topograph.mapping import KnownMap, Mapper, Solved
 from topograph.motion import Reckoner
-from topograph.pipeline.living import Live, State, mapping_config
+from topograph.pipeline.living import Live, State
+from topograph.pipeline.mapping import mapping_config
 from topograph.pipeline.read import WHOLE, Progress, child_mount, refuse_damaged, silent, stream
 from topograph.topomap import TopoMap
 

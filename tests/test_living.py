@@ -128,7 +128,7 @@ def test_gnss_that_comes_late_moves_the_map_into_its_frame(folder: Path, batch: 
                 heard = []
             elif not isinstance(m, (Fix, Heading)) or m.stamp_ns > recording.start_ns + 20 * 10**9:
                 heard.append(m)
-        solved, _ = live.finish()
+        solved = live.finish()
     before = [s for s in states if s.solved_ns and s.stamp_ns < recording.start_ns + 18 * 10**9]
     assert before
     assert not any(s.georeferenced for s in before)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from topograph.estimate import Estimate, Link, Problem, graph, path_at
 from topograph.geometry import Array, inverse, transform
 from topograph.mapping.config import MappingConfig
+from topograph.mapping.progress import Progress
 from topograph.trees import (
     AtKeyframes,
     Existence,
@@ -25,8 +25,6 @@ from topograph.trees import (
     shapes,
     tabulate,
 )
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,9 +53,6 @@ class Mapper:
         self._start_ns = start_ns
         self._solved_ns: int | None = None
 
-    def __len__(self) -> int:
-        return len(self._trunks)
-
     def hear(self, messages: Iterable[Odometry | Imu | Fix | Heading]) -> None:
         """Messages without a scan."""
         for m in messages:

@@ -12,16 +12,13 @@ from topograph.errors import InsufficientDataError
 from topograph.estimate import Estimate, Problem, path_at
 from topograph.estimate.assemble import assemble, choose_datum, without_wrong_headings
 from topograph.geometry import Array, Datum
-from topograph.mapping.association import Progress, associate_and_solve
+from topograph.mapping.association import associate_and_solve
 from topograph.mapping.config import MappingConfig
 from topograph.mapping.known import KnownMap, Placed, put
+from topograph.mapping.progress import Progress, silent
 from topograph.motion import Motion, align_imu, dead_reckon, in_radians, without_nonsense
 from topograph.session import Session, Streams
 from topograph.trees import Detections, Existence, Shapes, choose_keyframes, follow, screen
-
-
-def silent(stage: str, share: float) -> None:
-    """No progress shown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

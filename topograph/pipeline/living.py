@@ -19,7 +19,7 @@ from topograph.config import Config
 from topograph.errors import InsufficientDataError
 from topograph.geometry import Array, Datum, inverse, planar
 from topograph.localize import GraphMethod, Localizer
-from topograph.mapping import KnownMap, Mapper, Placed, Solved
+from topograph.mapping import Mapper, Placed, Solved
 from topograph.motion import Reckoner
 from topograph.pipeline.mapping import known_map, topo_map
 from topograph.pipeline.placing import LEAST, has_no_common_gnss, refuse_twice, spread
@@ -124,7 +124,7 @@ class Live:
             solve_s=solve_s,
         )
 
-    def finish(self) -> tuple[Solved, KnownMap | None]:
+    def finish(self) -> Solved:
         """The solve of the whole run, as `map` makes it; into the map that was given.
 
         Raises:
@@ -145,7 +145,7 @@ class Live:
                 raise InsufficientDataError("the run was not found in the map often enough to extend it")
             stamps = np.array([ns for ns, _ in self._placed], np.int64)
             placed = Placed(stamps[kept], poses[kept])
-        return self.mapper.finish(session, known, placed), known
+        return self.mapper.finish(session, known, placed)
 
     # -- where the robot is ---------------------------------------------------------------------------------------
 

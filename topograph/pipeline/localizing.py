@@ -17,7 +17,8 @@ from topograph.config import Config
 from topograph.errors import InsufficientDataError
 from topograph.geometry import Array
 from topograph.localize import Fix, GraphMethod, Localizer, Move, Report, Sweep, ThesisMethod, smooth
-from topograph.pipeline.read import WHOLE, Progress, child_mount, refuse_damaged, silent, stream
+from topograph.mapping import Progress, silent
+from topograph.pipeline.read import WHOLE, child_mount, refuse_damaged, stream
 from topograph.topomap import TopoMap
 
 

@@ -10,8 +10,7 @@ from topograph.config import Config
 from topograph.estimate import Estimate, average, path_at
 from topograph.evaluate import Metric, fix_metrics
 from topograph.geometry import transform
-from topograph.mapping import KnownMap, MappingConfig, Placed, Solved, map_T_scans, solve_session
-from topograph.pipeline.read import Progress, silent
+from topograph.mapping import KnownMap, MappingConfig, Placed, Progress, Solved, map_T_scans, silent, solve_session
 from topograph.session import Session
 from topograph.topomap import SessionRecord, TopoMap, build, merge
 from topograph.trees import Existence, in_order, seen_through, shapes

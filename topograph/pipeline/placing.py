@@ -13,8 +13,7 @@ from topograph.errors import InsufficientDataError, UsageError
 from topograph.estimate.assemble import LEAST_FIXES
 from topograph.geometry import Array, to_quaternion
 from topograph.localize import Localizer
-from topograph.mapping import Placed
-from topograph.pipeline.read import Progress, silent
+from topograph.mapping import Placed, Progress, silent
 from topograph.session import Session
 from topograph.topomap import TopoMap
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -19,6 +19,7 @@ from topograph.bags import DAMAGED, UNDECODED, Fix, Heading, Imu, Odometry, Reco
 from topograph.config import Config
 from topograph.errors import InputError
 from topograph.geometry import Array, inverse
+from topograph.mapping import Progress, silent
 from topograph.session import Session, Streams, StreamsBuilder, unknown_mounts
 from topograph.trunks import from_recorded
 
@@ -27,12 +28,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-Progress = Callable[[str, float], None]
 WHOLE = (0.0, float("inf"))
-
-
-def silent(stage: str, share: float) -> None:
-    """No progress shown."""
 
 
 def stream(

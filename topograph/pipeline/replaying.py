@@ -14,11 +14,11 @@ from topograph.config import Config
 from topograph.errors import InsufficientDataError
 from topograph.evaluate import Metric, Truth
 from topograph.geometry import interpolate
-from topograph.mapping import KnownMap, Mapper, Solved
+from topograph.mapping import Mapper, Progress, Solved, silent
 from topograph.motion import Reckoner
 from topograph.pipeline.living import Live, State
 from topograph.pipeline.mapping import mapping_config
-from topograph.pipeline.read import WHOLE, Progress, child_mount, refuse_damaged, silent, stream
+from topograph.pipeline.read import WHOLE, child_mount, refuse_damaged, stream
 from topograph.topomap import TopoMap
 
 
@@ -28,7 +28,6 @@ class Played:
 
     states: list[State] = field(default_factory=list)
     solved: Solved | None = None
-    known: KnownMap | None = None
     notes: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
 
@@ -79,7 +78,7 @@ def play(
     out.seconds["play"] = time.perf_counter() - began
     progress("finish", 0.0)
     began = time.perf_counter()
-    out.solved, out.known = live.finish()
+    out.solved = live.finish()
     out.seconds["finish"] = time.perf_counter() - began
     progress("finish", 1.0)
     return out

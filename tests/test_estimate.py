@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from topograph.config import Config
-from topograph.estimate import Estimate, EstimateConfig, Headings, Problem, average, graph, path_at
+from topograph.estimate import AverageConfig, Estimate, EstimateConfig, Headings, Problem, average, graph, path_at
 from topograph.estimate.assemble import no_fixes
 from topograph.evaluate import Truth, map_metrics
 from topograph.geometry import exp, inverse, planar, transform
@@ -110,9 +110,40 @@ def test_average_is_algorithm_3() -> None:
     p = problem(poses, np.array([[5.0, 0.0, 0.0]]), 1e-9, np.random.default_rng(0))
     z = p.detections.p.copy()
     z[1] += [0.4, 0.2, 0.0]
-    out = average.solve(replace(p, detections=replace(p.detections, p=z)), EstimateConfig())
+    out = average.solve(replace(p, detections=replace(p.detections, p=z)), AverageConfig(least=1))
     assert len(out.trees) == 1
     np.testing.assert_allclose(out.trees[0], [5.2, 0.1, 0.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("rule", "expected"), [("halving", 5.225), ("mean", 5.2), ("inverse", (0.25 * 5.0 + 4.0 * 5.3) / 4.25)]
+)
+def test_rungs_of_the_ladder(rule, expected: float) -> None:
+    """Three sightings at 5.0, 5.3 and 5.3 m, weighed by eq. 4.14, alike, and by their inverse variance (1/4, 1, 3): by hand."""
+    poses = planar(np.zeros(3), 0.0, 0.0)
+    p = problem(poses, np.array([[5.0, 0.0, 0.0]]), 1e-9, np.random.default_rng(0))
+    z = p.detections.p.copy()
+    z[:, 0] = 5.0, 5.3, 5.3
+    cov = np.tile(np.eye(3) * 1e-4, (3, 1, 1))
+    cov[0] *= 4.0
+    cov[2] /= 3.0
+    d = replace(p.detections, p=z, cov=cov)
+    out = average.solve(replace(p, detections=d), AverageConfig(least=1, rule=rule))
+    np.testing.assert_allclose(out.trees[0, 0], expected, atol=1e-6)
+
+
+def test_nearest_node_or_the_first_of_the_list() -> None:
+    """Two nodes 1 m apart, and a cluster nearer to the second: 4.3.3 means that one, Algorithm 3 as written takes the first within d_max."""
+    poses = planar(np.zeros(3), 0.0, 0.0)
+    p = problem(poses, np.array([[5.0, 0.0, 0.0]]), 1e-9, np.random.default_rng(0))
+    z = p.detections.p.copy()
+    z[:, 0] = 5.0, 6.6, 6.1
+    p = replace(p, detections=replace(p.detections, p=z))
+    near = average.solve(p, AverageConfig(least=1)).trees[:, 0]
+    first = average.solve(p, AverageConfig(least=1, nearest=False)).trees[:, 0]
+    np.testing.assert_allclose(near, [5.0, 6.35], atol=1e-6)
+    np.testing.assert_allclose(first, [5.55, 6.6], atol=1e-6)
+    assert len(average.solve(p, AverageConfig(least=2)).trees) == 1
 
 
 @pytest.fixture(scope="module")

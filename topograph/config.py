@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from topograph.bags import BagsConfig
 from topograph.errors import UsageError
-from topograph.estimate import EstimateConfig
+from topograph.estimate import AverageConfig, EstimateConfig
 from topograph.localize import LocalizeConfig, ThesisConfig
 from topograph.motion import MotionConfig
 from topograph.topomap import TopomapConfig
@@ -30,6 +30,7 @@ class Config:
     estimate: EstimateConfig = field(default_factory=EstimateConfig)
     topomap: TopomapConfig = field(default_factory=TopomapConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+    average: AverageConfig = field(default_factory=AverageConfig)
     thesis: ThesisConfig = field(default_factory=ThesisConfig)
     thesis_trunks: ThesisTrunksConfig = field(default_factory=ThesisTrunksConfig)
 

@@ -35,6 +35,8 @@ from topograph.errors import InputError, MapError, UsageError
 @click.argument("bags", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="The map file (.gpkg).")
 @click.option("--force", is_flag=True, help="Replace the map file of -o if it is there.")
+@click.option("--method", type=click.Choice(["graph", "thesis"]), default="graph", show_default=True,
+              help="graph: the factor graph; thesis: Algorithm 3 with filtered poses, to compare with.")  # fmt: skip
 @click.option("--into", type=click.Path(path_type=Path), help="Extend this map by the run; the file is replaced whole.")
 @click.option(
     "--accept",
@@ -58,7 +60,7 @@ from topograph.errors import InputError, MapError, UsageError
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 @input_options
 def map_command(
-    bags: tuple[Path, ...], output: Path | None, force: bool, into: Path | None, accept: tuple[str, ...], results: Path | None,
+    bags: tuple[Path, ...], output: Path | None, force: bool, method: str, into: Path | None, accept: tuple[str, ...], results: Path | None,
     truth: Path | None, check_fixes: int, from_s: float, to_s: float, jobs: int, quiet: bool, config_file: Path | None,
     **words: Any,
 ) -> None:  # fmt: skip
@@ -67,6 +69,8 @@ def map_command(
 
     if output is not None and into is not None:
         raise UsageError("-o makes a new map, --into extends one: give one of them")
+    if method == "thesis" and into is not None:
+        raise UsageError("--method thesis makes a new map: it cannot extend one")
     check_accepted(accept)
     if not 0.0 <= from_s < to_s:
         raise UsageError(f"--from {from_s} --to {to_s}: nothing lies between")
@@ -86,6 +90,11 @@ def map_command(
         inputs = stack.enter_context(hashed(bags))
         with progress_bar(quiet) as progress:
             run = pipeline.read_run(bags, config, progress, (from_s, to_s), jobs)
+            if method == "thesis":
+                topo = save_thesis(run, config, inputs(), folder, target, true, check_fixes)
+                trees = f"{target}: {len(topo)} trees by the thesis's method, {len(topo.edges)} edges, {len(topo.viewpoints)} viewpoints"
+                click.echo(f"{trees}; report: {folder / 'report.json'}")
+                return
             placed = None
             if old is not None:
                 pipeline.refuse_twice(old, run)
@@ -96,6 +105,39 @@ def map_command(
             )
             topo, verdict = save_results(solved, config, inputs, bags, folder, target, true, old, progress, accept)
     say_verdict(solved, topo, verdict, folder, target, run.notes)
+
+
+def save_thesis(
+    run: Any, config: Any, inputs: list[dict[str, str]], folder: Path, target: Path, true: Any, check_fixes: int
+) -> Any:
+    """Map by the thesis's method, with what can be said of it; it is not audited, for it states no uncertainty."""
+    import json
+
+    from topograph import pipeline, report, store
+    from topograph.config import dump
+    from topograph.errors import InsufficientDataError
+    from topograph.evaluate import truth_metrics, write_tum
+    from topograph.evaluate.metrics import doubles
+    from topograph.report.record import write_text
+
+    text = dump(config)
+    meta = {"config": text, "inputs": json.dumps(inputs), "versions": json.dumps(versions()), "verdict": "not audited"}
+    _, e, topo = pipeline.thesis_map(run, config, meta, check_fixes=check_fixes)
+    if not len(topo):
+        raise InsufficientDataError(f"no node has {config.average.least} clusters (average.least)")
+    metrics = [doubles(topo)] if true is None else truth_metrics(topo, e.stamps_ns, e.map_T_robot, true)
+    write_tum(folder / "path.tum", e.stamps_ns, e.map_T_robot)
+    write_text(folder / "config.yaml", text)
+    picture = report.map_figure(
+        topo, true.trees_in(topo.datum) if true is not None and topo.datum is not None else None
+    )
+    (folder / "map.png").write_bytes(picture)
+    store.save(topo, target)
+    report.write_json(
+        folder / "report.json", metrics, run.skipped, inputs, {"read": run.seconds, "average": e.seconds}, peak_mb(),
+        notes=run.notes, versions=versions(), topics=run.chosen, method="thesis",
+    )  # fmt: skip
+    return topo
 
 
 def say_verdict(solved: Any, topo: Any, verdict: Any, folder: Path, target: Path, notes: Sequence[str]) -> None:

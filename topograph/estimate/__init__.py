@@ -4,7 +4,18 @@
 know of each other.
 """
 
+from topograph.estimate.average import AverageConfig
 from topograph.estimate.path import path_at
 from topograph.estimate.problem import Estimate, EstimateConfig, Fixes, Headings, KnownTrees, Link, Problem
 
-__all__ = ["Estimate", "EstimateConfig", "Fixes", "Headings", "KnownTrees", "Link", "Problem", "path_at"]
+__all__ = [
+    "AverageConfig",
+    "Estimate",
+    "EstimateConfig",
+    "Fixes",
+    "Headings",
+    "KnownTrees",
+    "Link",
+    "Problem",
+    "path_at",
+]

@@ -1,40 +1,88 @@
-"""The thesis's map building (4.3.3, Algorithm 3): nearest node within d_max, mean of old and new.
+"""The thesis's map building (4.3.3, Algorithm 3): the node within d_max, mean of old and new; and the rungs between it and the graph.
 
-Robot poses come from an extended Kalman filter like ROS's `robot_localization`, run forward once (thesis 5.3).
+Robot poses come from an extended Kalman filter like ROS's `robot_localization`, run forward once (thesis 5.3), or from a path that is given.
 """
 
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from topograph.estimate.ekf import filtered_path
-from topograph.estimate.problem import Estimate, EstimateConfig, Problem
-from topograph.geometry import transform
+from topograph.estimate.path import path_at
+from topograph.estimate.problem import Estimate, Problem
+from topograph.geometry import Array, transform
+from topograph.ranges import Count, Positive
+
+Rule = Literal["halving", "mean", "inverse"]
 
 
-def solve(problem: Problem, config: EstimateConfig) -> Estimate:
-    """Path by filter, trees by running means. Covariances are NaN: the method has none."""
+@dataclass(frozen=True, slots=True)
+class AverageConfig:
+    """Algorithm 3, and what the thesis does not state of it.
+
+    Attributes:
+        d_max: a cluster nearer than this to a node is of that node, m (not stated in the thesis).
+        rule: "halving" is eq. 4.14, in which the last cluster has half of the weight; "mean" weighs all clusters alike; "inverse" by
+            their inverse covariance.
+        nearest: the nearest node within d_max takes the cluster, as 4.3.3 means it; else the first one in the list, as Algorithm 3 is
+            written.
+        least: nodes of fewer clusters are left out (the thesis keeps all: 1).
+        begin: where the filter starts: "batch", from a fit of the whole run (kind), or "first": the first fix and the first heading.
+    """
+
+    d_max: Positive = 1.5
+    rule: Rule = "halving"
+    nearest: bool = True
+    least: Count = 6
+    begin: Literal["batch", "first"] = "batch"
+
+
+def solve(problem: Problem, config: AverageConfig, path: Array | None = None) -> Estimate:
+    """Path by filter (or `path` (K, 4, 4) at the keyframes), trees by running means. Covariances are NaN: the method has none."""
     began = time.perf_counter()
     d = problem.detections
-    poses_at_scans = filtered_path(problem, d.stamps_ns)
-    seen = transform(poses_at_scans[d.scan], d.p) if len(d) else np.zeros((0, 3))
-    nodes = np.zeros((0, 3))
-    tree = np.full(len(d), -1, np.int64)
-    for i, c in enumerate(seen):
-        if len(nodes):
-            # Algorithm 3 takes the first node in range; the nearest one is its intent (4.3.3) and never worse.
-            distance = np.linalg.norm(nodes[:, :2] - c[:2], axis=1)
-            j = int(np.argmin(distance))
-            if distance[j] < config.d_max:
-                nodes[j] = 0.5 * (nodes[j] + c)  # eq. 4.14
-                tree[i] = j
-                continue
-        nodes = np.vstack([nodes, c])
-        tree[i] = len(nodes) - 1
-    path = filtered_path(problem, problem.stamps_ns)
+    if path is None:
+        path = filtered_path(problem, problem.stamps_ns, config.begin)
+        map_T_scan = filtered_path(problem, d.stamps_ns, config.begin)
+    else:
+        map_T_scan = path_at(problem.stamps_ns, path, problem.motion, d.stamps_ns)
+    poses = map_T_scan[d.scan]
+    seen = transform(poses, d.p) if len(d) else np.zeros((0, 3))
+    weight = np.ones(len(d))
+    if config.rule == "inverse" and len(d):
+        R = poses[:, :3, :3]
+        cov = (R @ d.cov @ R.transpose(0, 2, 1))[:, :2, :2]
+        weight = 2.0 / np.maximum(np.trace(cov, axis1=1, axis2=2), 1e-8)
+    nodes, tree = _nodes(seen, weight, config)
+    hits = np.bincount(tree, minlength=len(nodes))
+    keep = hits >= config.least
+    name = np.where(keep, np.cumsum(keep) - 1, -1)
     return Estimate(
-        problem.stamps_ns, path, nodes, np.full((len(nodes), 3, 3), np.nan), None, np.full((3, 3), np.nan), tree,
-        np.ones(0), {}, {}, time.perf_counter() - began,
+        problem.stamps_ns, path, nodes[keep], np.full((int(keep.sum()), 3, 3), np.nan), None, np.full((3, 3), np.nan),
+        name[tree] if len(tree) else tree, np.ones(0), {}, {}, time.perf_counter() - began,
     )  # fmt: skip
+
+
+def _nodes(seen: Array, weight: Array, config: AverageConfig) -> tuple[Array, NDArray[np.int64]]:
+    """Nodes (T, 3) of clusters (N, 3) as they came, and the node (N,) of each."""
+    nodes, total = np.zeros((len(seen), 3)), np.zeros(len(seen))
+    tree = np.full(len(seen), -1, np.int64)
+    n = 0
+    for i, c in enumerate(seen):
+        distance = np.linalg.norm(nodes[:n, :2] - c[:2], axis=1)
+        near = np.flatnonzero(distance < config.d_max)
+        if not len(near):
+            nodes[n], total[n], tree[i] = c, weight[i], n
+            n += 1
+            continue
+        j = int(near[np.argmin(distance[near])] if config.nearest else near[0])
+        total[j] += weight[i]
+        share = 0.5 if config.rule == "halving" else weight[i] / total[j]  # eq. 4.14
+        nodes[j] += share * (c - nodes[j])
+        tree[i] = j
+    return nodes[:n], tree

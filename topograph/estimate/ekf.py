@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
 from topograph.estimate.initial import initial_path
@@ -9,8 +11,11 @@ from topograph.estimate.problem import Problem
 from topograph.geometry import Array, Stamps, inverse, planar, wrap, yaw_of
 
 
-def filtered_path(problem: Problem, stamps_ns: Stamps) -> Array:
+def filtered_path(problem: Problem, stamps_ns: Stamps, begin: Literal["batch", "first"] = "batch") -> Array:
     """Poses (S, 4, 4) at `stamps_ns`, each from what was known until then.
+
+    It begins where a fit of the whole run has it ("batch", which knows what comes), or at the "first" fix with the first heading, as
+    `robot_localization` would.
 
     State x, y, z, yaw; roll and pitch are dead reckoning's (the IMU's attitude), as in the thesis's setup.
     """
@@ -23,7 +28,7 @@ def filtered_path(problem: Problem, stamps_ns: Stamps) -> Array:
     times = np.array([e[0] for e in events], np.int64)
     odom = motion.at(times)
     sigma = motion.sigma(problem.motion_config, times) if len(times) > 1 else np.zeros((0, 6))
-    start = initial_path(problem)[0]
+    start = initial_path(problem)[0] if begin == "batch" else _first_pose(problem)
     x = np.array([*start[:3, 3], float(yaw_of(start))])
     first = motion.at(problem.stamps_ns[:1])[0]
     P = np.diag([1.0, 1.0, 1.0, 0.05])
@@ -45,6 +50,23 @@ def filtered_path(problem: Problem, stamps_ns: Stamps) -> Array:
             e = wrap([h.yaw[i] - np.arctan2(d[1], d[0])])
             x, P = _update(x, P, e, np.array([[0.0, 0.0, 0.0, 1.0]]), np.array([[max(h.sigma[i], 2e-3) ** 2]]))
     return out
+
+
+def _first_pose(problem: Problem) -> Array:
+    """Pose (4, 4) of the first keyframe: turned by the first heading, at the first fix; the batch's where there are none."""
+    f, h = problem.fixes, problem.headings
+    if not len(f.keyframe):
+        return np.asarray(initial_path(problem)[0])
+    turn = 0.0
+    if len(h.keyframe):
+        d = problem.odom_T_robot[h.keyframe[0]][:3, :3] @ h.direction[0]
+        turn = float(h.yaw[0] - np.arctan2(d[1], d[0]))
+    else:
+        turn = float(yaw_of(initial_path(problem)[0]) - yaw_of(problem.odom_T_robot[0]))
+    first = planar(0.0, 0.0, turn) @ problem.odom_T_robot
+    at = first[f.keyframe[0]]
+    first[0, :3, 3] += f.map_p_antenna[0] - (at[:3, :3] @ f.keyframe_p_antenna[0] + at[:3, 3])
+    return np.asarray(first[0])
 
 
 def _pose(x: Array, odom_T_robot: Array) -> Array:

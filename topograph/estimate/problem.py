@@ -29,7 +29,6 @@ class EstimateConfig:
         most_sightings, quick_sightings: of one keyframe that are used, the surest first: where a hundred trunks are in
             view, the far ones add errors of their own kind and no information.
         iterations: most steps of a pass.
-        d_max: of the thesis's Algorithm 3, m.
     """
 
     keyframe_distance: Positive = 0.5
@@ -46,7 +45,6 @@ class EstimateConfig:
     most_sightings: Count = 30
     quick_sightings: Count = 25
     iterations: Count = 40
-    d_max: Positive = 1.5
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ class LocalizeConfig:
         seen: chance that a trunk in view is detected in one scan; held against what the run shows.
         clutter: share of detections that are no lasting object.
         new, felled: share of trees that are not in the map; of mapped trees that are gone or never seen.
+        map_unknown: standard deviation of a tree whose covariance the map does not state, m (the thesis's maps).
         map_sigma: least standard deviation of a mapped tree per axis: what its covariance does not know.
         trunk_sigma: added to every detection's deviation: the centre depends on the side that is seen.
         diameter_sigma: least deviation between a diameter as mapped and as measured.
@@ -51,6 +52,7 @@ class LocalizeConfig:
     clutter: Share = 0.1
     new: Chance = 0.04
     felled: Chance = 0.04
+    map_unknown: Positive = 0.15
     map_sigma: Positive = 0.03
     trunk_sigma: NonNegative = 0.015
     diameter_sigma: Positive = 0.03

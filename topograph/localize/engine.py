@@ -13,7 +13,7 @@ from topograph.geometry import Array
 from topograph.localize.config import LocalizeConfig
 from topograph.localize.evidence import Posterior, describe, nothing, weigh
 from topograph.localize.filter import Filter
-from topograph.localize.hypothesis import Hypothesis
+from topograph.localize.hypothesis import DRAGGED, Hypothesis
 from topograph.localize.index import MapIndex
 from topograph.localize.search import Found, Landmarks, search, searching
 from topograph.localize.submap import BINS, Move, Submap, Sweep, Visibility, absorb, assign, in_reach, in_view, sectors
@@ -27,6 +27,10 @@ UNSEEN = 4.0
 20 cm off."""
 MET, FADE = 0.5, 0.9
 """Share of the near mapped trees, of those that should be seen, below which a track is doubted; weight of the scans before."""
+DRAGGED_AGAIN = 5.0
+"""Metres within which a second drag says that the place is lost."""
+CROWD, FEW = 3.0, 0.3
+"""Where more trees than this should be seen, and fewer than this share of them are, the pose is in doubt at once."""
 NO_PAIRS = np.zeros((0, 2), np.int64)
 STATES = ("searching", "ambiguous", "tracking", "degraded", "lost")
 
@@ -85,6 +89,7 @@ class Engine:
         self.risk = 1.0
         self.sums = np.zeros(2)
         self._matched_at = 0.0
+        self._dragged_at = -np.inf
         self._met = np.zeros(2)
         self.losses = 0
 
@@ -119,6 +124,8 @@ class Engine:
             self.state = "degraded"
         if self.graph is not None:
             self.graph.step(move, sweep, pairs)
+            if self.graph.dragged > DRAGGED:
+                self._forget_drag()
         self._shadow()
         if self.sums[0] > self.config.lost or self.sums[1] > self.config.slip:
             self._lose(sweep)
@@ -204,6 +211,19 @@ class Engine:
         f.mean[:], f.cov[:] = pose, cov
         self._tracked(f, self.config.risk)
 
+    def _forget_drag(self) -> None:
+        """What was learnt of the trees' places is dropped: the map's are taken again, from a pose as unsure as they were moved."""
+        assert self.graph is not None
+        assert self.track is not None
+        self.graph = self.graph.anew()
+        f = self.track
+        if f.run - self._dragged_at < DRAGGED_AGAIN:
+            self.sums[0] = np.inf
+        self._dragged_at = f.run
+        f.keep(np.zeros(f.n, bool))
+        f.mean[:3], f.cov[:3, :3] = self.graph.pose, self.graph.cov
+        self.state = "degraded"
+
     def _commit(self) -> Filter:
         return self._tracked(anchored(self.hunt, self.index, self.config), self.hunt.posterior.risk)
 
@@ -217,6 +237,7 @@ class Engine:
         self.sums[:] = 0.0
         self._met[:] = 0.0
         self._matched_at = self.track.run
+        self._dragged_at = -np.inf
         self.hunt = _Hunt(Submap(self.config, self.visibility))
         return self.track
 
@@ -258,6 +279,7 @@ class Engine:
         sigma = float(np.sqrt(max(f.cov[0, 0], f.cov[1, 1])))
         doubt = self.sums[0] > 0.5 * c.lost or self.sums[1] > 0.5 * c.slip
         doubt |= self._met[0] < MET * self._met[1] and self._met[1] > 3.0
+        doubt |= float(chance.sum()) > CROWD and float(found[expected].sum()) < FEW * float(chance.sum())
         far = f.run - self._matched_at > UNSEEN
         self.state = "degraded" if sigma > c.degraded or doubt or far else "tracking"
         if sigma > 5.0 * c.degraded:

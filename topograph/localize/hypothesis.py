@@ -26,6 +26,11 @@ STEPS = 2
 HUBER = Kernel("huber", 2.0)
 AWAY = 8.0
 """Trees that are further beyond the view, m, are marginalised: what was learnt of nearer ones is wanted when they are seen again."""
+DRAGGED = 2.0
+"""Deviations of the map by which most trees in view may seem to stand elsewhere. Something that lasts pulls at them, such as a tilt that
+nobody knows of, and what was learnt of the trees from scan to scan is wrong."""
+ANEW_YAW = 0.03
+"""Of the heading then, rad."""
 LEAST = 1e-10
 """Added to the variances of a step: a robot that stands has none."""
 
@@ -48,12 +53,14 @@ class Hypothesis:
         prior = gtsam.PriorFactorPose2(_X(0), gtsam.Pose2(*pose), gtsam.noiseModel.Gaussian.Covariance(own))
         self._factors: list[Any] = [prior]
         self._last_seen: dict[int, int] = {}
+        self.dragged = 0.0
         self.pose, self.cov = np.asarray(pose, float).copy(), np.asarray(cov, float).copy()
 
     def step(self, move: Move, sweep: Sweep, pairs: NDArray[np.int64]) -> None:
         """One scan further: `move` leads to it, `pairs` (N, 2) are rows of `sweep` and of the map's trees."""
         noise = gtsam.noiseModel.Gaussian.Covariance(move.cov + LEAST * np.eye(3))
         step = gtsam.Pose2(*move.step)
+        self.dragged = 0.0
         self._factors.append(gtsam.BetweenFactorPose2(_X(self._k), _X(self._k + 1), step, noise))
         self._values.insert(_X(self._k + 1), self._values.atPose2(_X(self._k)).compose(step))
         self._k += 1
@@ -71,6 +78,7 @@ class Hypothesis:
                 sighting_2d(_X(self._k), _L(t), sweep.p[i], sweep.cov[i] + side, HUBER, self.config.measure)
             )
         self._solve()
+        self.dragged = self._moved(pairs[:, 1])
         if len(self._poses) > LAG + OLDEST:
             self._marginalise()
 
@@ -93,6 +101,18 @@ class Hypothesis:
         self.pose = np.array([last.x(), last.y(), last.theta()])
         turn = _turn(last.theta())
         self.cov = turn @ (inverse @ inverse.T) @ turn.T
+
+    def anew(self) -> Hypothesis:
+        """The same place without what was learnt of its trees: they have been dragged along, as far as the pose may be off."""
+        by = self.dragged**2 * float(np.median(self.var))
+        return Hypothesis(self.pose, self.cov + np.diag([by, by, ANEW_YAW**2]), self.trees, self.var, self.config)
+
+    def _moved(self, seen: NDArray[np.int64]) -> float:
+        """How far, in the map's own standard deviations, most of the trees that are `seen` have been moved from where the map has them."""
+        if len(seen) < 3:
+            return 0.0
+        at = np.array([self._values.atPoint2(_L(t)) for t in seen.tolist()])
+        return float(np.median(np.linalg.norm(at - self.trees[seen], axis=1) / np.sqrt(self.var[seen])))
 
     def _marginalise(self) -> None:
         """The oldest poses, and trees that only they saw, become a linear factor on the rest."""

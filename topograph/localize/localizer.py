@@ -26,6 +26,8 @@ from topograph.trunks import none_at
 if TYPE_CHECKING:  # loading it takes a second, and recorded trunks do without
     from topograph.trunks.frontend import FrontEnd
 
+UNKNOWN_TILT = 0.12
+"""Deviation of roll and pitch on the slopes of orchards, rad, where no IMU tells them."""
 HEADING_FLOOR = 0.004
 """Least deviation of a heading from trees for learning the gyro's bias, rad: its errors last over many scans."""
 
@@ -125,6 +127,7 @@ class GraphMethod:
         self._slip = SlipWatch()
         self.contradicted = False
         self._last_p = np.zeros((0, 3))
+        self._seen_at = 0.0
 
     def _begin(self, trunks: Trunks) -> Engine:
         """The index is built at the height at which this front end states its trunks."""
@@ -133,7 +136,9 @@ class GraphMethod:
         t = self.topo
         xy = t.p[:, :2] + t.axis[:, :2] * (self.height / np.maximum(t.axis[:, 2:], 0.3))
         var = 0.5 * (t.cov[:, 0, 0] + t.cov[:, 1, 1])
-        var = np.where(np.isfinite(var), np.clip(var - 0.5 * np.trace(t.datum_cov[:2, :2]), 0.0, 1.0), 0.0)
+        var = np.where(
+            np.isfinite(var), np.clip(var - 0.5 * np.trace(t.datum_cov[:2, :2]), 0.0, 1.0), self.config.map_unknown**2
+        )
         return Engine(
             build_index(xy, var, t.diameter, self.config.view, self.config.pair, self.config.map_sigma), self.config
         )
@@ -163,6 +168,8 @@ class GraphMethod:
         level_T_robot = from_xyz_rpy(0, 0, 0, leg.roll, leg.pitch, 0)
         flat = transform(level_T_robot, trunks.p) if len(trunks) else np.zeros((0, 3))
         watched = self._slip.check(flat, leg)
+        if len(flat):
+            self._seen_at = float(np.median(np.abs(flat[:, 2])))
         self.move = move_of(watched, self.config)
         self.sweep, rows = sweep_of(trunks, level_T_robot, leg, self.config)
         self.contradicted = watched is not leg
@@ -203,7 +210,7 @@ class GraphMethod:
             P[:] = np.diag([1e4, 0.0, 0.0])
             return
         if P[0, 0] > 1e3:
-            tilt = (0.01 if leg.level else 0.12) ** 2
+            tilt = (0.01 if leg.level else UNKNOWN_TILT) ** 2
             P[:] = np.diag([100.0, tilt, tilt])
         x[0] += leg.up
         drift = (0.001 if leg.level else 0.02) ** 2 * leg.distance
@@ -227,6 +234,8 @@ class GraphMethod:
         cov[np.ix_([5, 0, 1], [5, 0, 1])] = self._tilt_cov
         cov[[0, 1], [0, 1]] += 0.01**2
         cov[[3, 4], [3, 4]] += self._slip.standing**2
+        if not leg.level:  # trunks that are seen so high above the base are shifted by the tilt, all alike
+            cov[[3, 4], [3, 4]] += (UNKNOWN_TILT * self._seen_at) ** 2
         return Fix(stamp_ns, T, cov, belief.risk)
 
 

@@ -4,14 +4,15 @@ Distances and ICP give each trunk a list of candidate nodes; all combinations th
 by multilateration (3.4); poses are predicted by odometry, averaged with a measured pose within a gate (eq. 4.18), and
 dropped when too many scans went by without one. It commits when one pose is left.
 
-Where the thesis is silent: edges join all nodes within twice the view, for with neighbours only most pairs of trunks would
-have no edge; heading comes from the bearings of the combination's trees; combinations are built by backtracking, which
-gives those that the thesis's table would leave, and above `combinations` of them the scan measures nothing.
+Where the thesis is silent: heading comes from the bearings of the combination's trees; combinations are built by backtracking, which
+gives those that the thesis's table would leave, and above `combinations` of them the scan measures nothing. The defaults are kinder
+than Algorithms 4-6 as they are written: `configs/thesis.yaml` has these, `configs/thesis_best.yaml` says where the two differ.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from topograph.geometry import Array, from_xyz_rpy, transform
 from topograph.localize.method import Fix, Report
 from topograph.motion import Leg
 from topograph.ranges import Count, NonNegative, Positive
-from topograph.topomap import TopoMap
+from topograph.topomap import Query, Target, TopoMap
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,22 +32,46 @@ class ThesisConfig:
 
     Attributes:
         distance: D_th of Algorithm 4; `consistency` the same in the check of combinations.
+        edges: which distances between nodes Algorithm 4 looks in: "view", all within twice the view, or "map", the map's edges.
         icp: score_th of Algorithm 5, mean squared distance of the registered clouds, m²; 0 leaves the step out.
-        gate: d_max of Algorithm 6; `count` is cnt_th.
+        icp_turn: registration begins with the line of sight turned onto the node's viewpoint, or ("none") as the robot stands.
+        gate: d_max of Algorithm 6; `gate_yaw` the same for the heading, rad (the thesis has none).
+        first: the first measured pose in the gate is taken, as Algorithm 6 is written, not the nearest.
+        count: cnt_th, iterations without a measured pose; `count_distance`, where it is not 0, metres without one instead.
+        reset: a measured pose sets the counter back to zero; Algorithm 6 never does.
+        step: metres from one measurement to the next (the thesis took a cloud every 2 m); 0: every scan. Between, odometry predicts.
         view: farthest trunk used; `trunks` how many, the nearest first.
         combinations: most combinations of one scan.
-        merge: poses nearer than this are one.
+        merge: poses nearer than this are one; 0: they never are, as in the thesis.
     """
 
     distance: Positive = 0.3
     consistency: Positive = 0.3
+    edges: Literal["view", "map"] = "view"
     icp: NonNegative = 0.05
+    icp_turn: Literal["viewpoint", "none"] = "viewpoint"
     gate: Positive = 1.0
+    gate_yaw: Positive = 0.5
+    first: bool = False
     count: Count = 5
+    count_distance: NonNegative = 0.0
+    reset: bool = True
+    step: NonNegative = 0.0
     view: Positive = 10.0
     trunks: Count = 5
     combinations: Count = 2000
-    merge: Positive = 0.3
+    merge: NonNegative = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """Poses (Z, 3) by multilateration, and the rows of the map's nodes each of them rests on."""
+
+    poses: Array
+    nodes: list[tuple[int, ...]]
+
+
+NOTHING = Measured(np.zeros((0, 3)), [])
 
 
 class ThesisMethod:
@@ -60,46 +85,68 @@ class ThesisMethod:
         self.topo = topo = topo.trees()  # the thesis knows no other landmarks
         self.config = config or ThesisConfig()
         self.nodes = topo.p[:, :2] + topo.axis[:, :2] * (0.8 / np.maximum(topo.axis[:, 2:], 0.3))
-        pairs = cKDTree(self.nodes).query_pairs(2 * self.config.view, output_type="ndarray")
-        self.edges = pairs.reshape(-1, 2)
+        if self.config.edges == "map":
+            self.edges = topo.edges
+        else:
+            pairs = cKDTree(self.nodes).query_pairs(2 * self.config.view, output_type="ndarray")
+            self.edges = pairs.reshape(-1, 2)
         length = np.linalg.norm(self.nodes[self.edges[:, 0]] - self.nodes[self.edges[:, 1]], axis=1)
         order = np.argsort(length)
         self.edges, self.length = self.edges[order], length[order]
         self.poses = np.zeros((0, 3))
-        self.counts = np.zeros(0, np.int64)
+        self.counts = np.zeros(0)
+        self.by: list[tuple[int, ...]] = []
         self.started = False
+        self._since = 0.0
+        self._targets: dict[int, list[tuple[float, Target]]] = {int(t): [] for t in range(len(topo))}
+        for v in topo.viewpoints:
+            if len(v.cloud) >= FULL_CLOUD:
+                self._targets[v.tree].append((float(np.arctan2(v.direction[1], v.direction[0])), Target(v.cloud)))
         self.exploded = 0
         self._z = float(np.median(topo.p[:, 2])) if len(topo) else 0.0
 
     def step(self, trunks: Trunks, leg: Leg) -> Report:
         """One scan further."""
+        self._since += leg.distance
+        if self.started and self._since < self.config.step:
+            self.poses, self.by = _moved(self.poses, leg), [()] * len(self.poses)
+            return self._report(trunks.stamp_ns, leg)
+        driven, self._since = self._since, 0.0
+        self._update(self._measure(trunks, leg), leg, driven)
+        return self._report(trunks.stamp_ns, leg)
+
+    def _measure(self, trunks: Trunks, leg: Leg) -> Measured:
+        """Local map matching and multilateration."""
         flat = transform(from_xyz_rpy(0, 0, 0, leg.roll, leg.pitch, 0), trunks.p) if len(trunks) else np.zeros((0, 3))
         reach = np.hypot(flat[:, 0], flat[:, 1])
         use = [int(i) for i in np.argsort(reach) if 0.3 < reach[i] < self.config.view and trunks.score[i] >= 0]
         use = use[: self.config.trunks]
-        measured = np.zeros((0, 3))
-        if len(use) > 1:
-            clouds = [trunks.clouds[i] if trunks.clouds else None for i in use]
-            z = flat[use, :2]
-            candidates = [self._by_icp(c, n) for c, n in zip(clouds, self._by_distance(z), strict=True)]
-            measured = np.array([multilaterate(z, self.nodes[list(c)]) for c in self._combine(z, candidates)]).reshape(
-                -1, 3
-            )
-        self._update(measured, leg)
+        if len(use) < 2:
+            return NOTHING
+        z = flat[use, :2]
+        clouds = [trunks.clouds[i] if trunks.clouds else None for i in use]
+        candidates = [
+            self._by_icp(c, p, n) for c, p, n in zip(clouds, trunks.p[use], self._by_distance(z), strict=True)
+        ]
+        found = self._combine(z, candidates)
+        poses = np.array([multilaterate(z, self.nodes[list(c)]) for c in found]).reshape(-1, 3)
+        return Measured(poses, found)
+
+    def _report(self, stamp_ns: int, leg: Leg) -> Report:
         n = len(self.poses)
         fix = None
+        trees = np.zeros(0, np.int64)
         if n == 1:
             x, y, yaw = self.poses[0]
             near = np.argmin(np.hypot(*(self.topo.p[:, :2] - [x, y]).T))
             T = from_xyz_rpy(x, y, self.topo.p[near, 2], leg.roll, leg.pitch, yaw)
-            fix = Fix(trunks.stamp_ns, T, np.full((6, 6), np.nan), np.nan)
+            fix = Fix(stamp_ns, T, np.full((6, 6), np.nan), np.nan)
+            trees = self.topo.ids[list(self.by[0])]
         state = "tracking" if n == 1 else "ambiguous" if n else "lost" if self.started else "searching"
         if not n:
             self.started = False
-        none = np.zeros(0, np.int64)
-        return Report(
-            trunks.stamp_ns, state, fix, n, np.nan, self.poses[:200], none, np.zeros((0, 2), np.int64), np.nan, np.nan
-        )
+        pairs = np.zeros((0, 2), np.int64)
+        return Report(stamp_ns, state, fix, n, np.nan, self.poses[:200], trees, pairs, np.nan, np.nan)
 
     def _by_distance(self, z: Array) -> list[NDArray[np.int64]]:
         """Algorithm 4: candidate nodes of each trunk."""
@@ -119,13 +166,21 @@ class ThesisMethod:
             out.append(np.zeros(0, np.int64) if common is None else common)
         return out
 
-    def _by_icp(self, cloud: NDArray[np.float32] | None, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Algorithm 5: the candidates onto whose cloud the trunk's cloud can be registered."""
-        if cloud is None or len(cloud) < 8 or self.config.icp <= 0 or not self.topo.viewpoints:
+    def _by_icp(self, cloud: NDArray[np.float32] | None, p: Array, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Algorithm 5: the candidates onto whose cloud the cloud of a trunk at `p` (3,) can be registered; a node without clouds passes."""
+        if cloud is None or len(cloud) < FULL_CLOUD or self.config.icp <= 0 or not self.topo.viewpoints:
             return nodes
-        centred = np.asarray(cloud - cloud.mean(0), float)
-        of = {int(t): [v.cloud for v in self.topo.viewpoints if v.tree == t and len(v.cloud) >= 8] for t in nodes}
-        keep = [t for t in nodes if not of[int(t)] or min(_fitness(centred, c) for c in of[int(t)]) < self.config.icp]
+        query = Query(cloud)
+        sight = float(np.arctan2(-p[1], -p[0])) if self.config.icp_turn == "viewpoint" else None
+        keep = [
+            t
+            for t in nodes.tolist()
+            if not self._targets[t]
+            or any(
+                query.fitness(target, 0.0 if sight is None else yaw - sight) < self.config.icp
+                for yaw, target in self._targets[t]
+            )
+        ]
         return np.array(keep, np.int64)
 
     def _combine(self, z: Array, candidates: list[NDArray[np.int64]]) -> list[tuple[int, ...]]:
@@ -152,41 +207,58 @@ class ThesisMethod:
             return []
         return found
 
-    def _update(self, measured: Array, leg: Leg) -> None:
-        """Algorithm 6."""
-        c = self.config
+    def _update(self, measured: Measured, leg: Leg, driven: float) -> None:
+        """Algorithm 6, `driven` metres after the last iteration."""
+        c, z = self.config, measured.poses
         if not self.started:
-            if len(measured):
-                self.poses, self.counts, self.started = measured.copy(), np.zeros(len(measured), np.int64), True
+            if len(z):
+                self.poses, self.counts, self.started = z.copy(), np.zeros(len(z)), True
+                self.by = list(measured.nodes)
             self._merge()
             return
-        alive = self.counts <= c.count
-        poses, counts = self.poses[alive], self.counts[alive]
-        cs, sn = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-        dx, dy, turn = leg.step
-        poses = poses + np.stack([cs * dx - sn * dy, sn * dx + cs * dy, np.full(len(poses), turn)], axis=1)
-        tree = cKDTree(measured[:, :2]) if len(measured) else None
+        alive = self.counts <= (c.count_distance or c.count)
+        poses, counts = _moved(self.poses[alive], leg), self.counts[alive]
+        by: list[tuple[int, ...]] = [()] * len(poses)
+        tree = cKDTree(z[:, :2]) if len(z) else None
         for k in range(len(poses)):
             near = tree.query_ball_point(poses[k, :2], c.gate) if tree is not None else []
-            turns = [abs((measured[i, 2] - poses[k, 2] + np.pi) % (2 * np.pi) - np.pi) for i in near]
-            near = [i for i, a in zip(near, turns, strict=True) if a < 0.5]
+            near = [i for i in sorted(near) if abs(_turned(z[i, 2] - poses[k, 2])) < c.gate_yaw]
             if not near:
-                counts[k] += 1
+                counts[k] += driven if c.count_distance else 1
                 continue
-            z = measured[min(near, key=lambda i: float(np.hypot(*(measured[i, :2] - poses[k, :2]))))]
-            away = (z[2] - poses[k, 2] + np.pi) % (2 * np.pi) - np.pi
-            poses[k] = [*(0.5 * (poses[k, :2] + z[:2])), poses[k, 2] + 0.5 * away]  # eq. 4.18
-            counts[k] = 0
-        self.poses, self.counts = poses, counts
+            chosen = near[0] if c.first else min(near, key=lambda i: float(np.hypot(*(z[i, :2] - poses[k, :2]))))
+            away = _turned(z[chosen, 2] - poses[k, 2])
+            poses[k] = [*(0.5 * (poses[k, :2] + z[chosen, :2])), poses[k, 2] + 0.5 * away]  # eq. 4.18
+            by[k] = measured.nodes[chosen]
+            if c.reset:
+                counts[k] = 0
+        self.poses, self.counts, self.by = poses, counts, by
         self._merge()
 
     def _merge(self) -> None:
         """Poses that have become one are one."""
+        if self.config.merge <= 0:
+            return
         keep: list[int] = []
         for k in np.argsort(self.counts, kind="stable").tolist():
             if all(np.hypot(*(self.poses[k, :2] - self.poses[q, :2])) > self.config.merge for q in keep):
                 keep.append(k)
-        self.poses, self.counts = self.poses[keep], self.counts[keep]
+        self.poses, self.counts, self.by = self.poses[keep], self.counts[keep], [self.by[k] for k in keep]
+
+
+FULL_CLOUD = 12
+"""Points of a cloud that can be registered."""
+
+
+def _moved(poses: Array, leg: Leg) -> Array:
+    """Poses (N, 3) a leg further (eq. 4.17)."""
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    dx, dy, turn = leg.step
+    return np.asarray(poses + np.stack([c * dx - s * dy, s * dx + c * dy, np.full(len(poses), turn)], axis=1))
+
+
+def _turned(angle: float) -> float:
+    return float((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
 def multilaterate(z: Array, beacons: Array, steps: int = 100) -> Array:
@@ -209,17 +281,3 @@ def multilaterate(z: Array, beacons: Array, steps: int = 100) -> Array:
             break
     seen = np.arctan2(*(beacons - x).T[::-1]) - np.arctan2(z[:, 1], z[:, 0])
     return np.array([x[0], x[1], np.arctan2(np.sin(seen).sum(), np.cos(seen).sum())])
-
-
-def _fitness(cloud: Array, node: NDArray[np.float32]) -> float:
-    """Mean squared distance of a cloud registered to a node's cloud (point-to-point ICP, translation start), m²."""
-    target = np.asarray(node - node.mean(0), float)
-    tree = cKDTree(target)
-    moved = cloud.copy()
-    for _ in range(10):
-        _, near = tree.query(moved)
-        goal = target[near]
-        U, _, Vt = np.linalg.svd((goal - goal.mean(0)).T @ (moved - moved.mean(0)))
-        R = U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-        moved = (moved - moved.mean(0)) @ R.T + goal.mean(0)
-    return float(np.mean(tree.query(moved)[0] ** 2))

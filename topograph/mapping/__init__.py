@@ -4,16 +4,18 @@ from topograph.mapping.config import MappingConfig
 from topograph.mapping.known import KnownMap, Placed
 from topograph.mapping.mapper import Mapper
 from topograph.mapping.progress import Progress, silent
-from topograph.mapping.solve import Solved, map_T_scans, solve_session
+from topograph.mapping.solve import Prepared, Solved, map_T_scans, prepare, solve_session
 
 __all__ = [
     "KnownMap",
     "Mapper",
     "MappingConfig",
     "Placed",
+    "Prepared",
     "Progress",
     "Solved",
     "map_T_scans",
+    "prepare",
     "silent",
     "solve_session",
 ]

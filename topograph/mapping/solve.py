@@ -52,6 +52,26 @@ class Solved:
     seconds: dict[str, float]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prepared:
+    """A run, ready to be solved.
+
+    Attributes:
+        streams: the small streams as they are used: without nonsense, clocks set right.
+        problem: with all detections, and no sightings yet.
+        track: (N,) track of each detection.
+        moving: share of the detections that were of things that moved or rode along.
+        held_out: (H,) indices of the fixes withheld from the estimator.
+    """
+
+    run: Session
+    streams: Streams
+    problem: Problem
+    track: NDArray[np.int64]
+    moving: float
+    held_out: NDArray[np.int64]
+
+
 def solve_session(
     run: Session,
     config: MappingConfig,
@@ -62,15 +82,46 @@ def solve_session(
     datum: Datum | None = None,
     progress: Progress = silent,
 ) -> Solved:
-    """Associate and solve. Every `check_fixes`-th fix is withheld from the estimator and kept for checking.
+    """Prepare, associate and solve; see `prepare`."""
+    began = time.perf_counter()
+    p = prepare(run, config, check_fixes=check_fixes, known=known, placed=placed, datum=datum)
+    decided, estimate, loops = associate_and_solve(p.problem, p.track, config, progress)
+    return Solved(
+        run=run,
+        streams=p.streams,
+        motion=p.problem.motion,
+        detections=decided.problem.detections,
+        problem=decided.problem,
+        estimate=estimate,
+        tree=decided.tree,
+        existence=decided.existence,
+        shapes=decided.shapes,
+        held_out=p.held_out,
+        rejected=decided.rejected,
+        loops=loops,
+        moving=p.moving,
+        seconds={"read": run.seconds, "associate and solve": time.perf_counter() - began},
+    )
+
+
+def prepare(
+    run: Session,
+    config: MappingConfig,
+    *,
+    check_fixes: int = 0,
+    known: KnownMap | None = None,
+    placed: Placed | None = None,
+    datum: Datum | None = None,
+    screened: bool = True,
+) -> Prepared:
+    """What a run is before anything is solved. Every `check_fixes`-th fix is withheld from the estimator and kept for checking.
 
     With a `known` map the run is put into its frame, by GNSS or where it was `placed` in it, and its trees are landmarks with
-    their covariances. A `datum` that is given is kept to, where there are fixes.
+    their covariances. A `datum` that is given is kept to, where there are fixes. Not `screened`, what moved is not left out, as in the thesis.
 
     Raises:
         InsufficientDataError: neither motion nor fixes; or a known map and no common frame.
     """
-    began = time.perf_counter()
     notes, skipped = run.notes, run.skipped
     streams, said = in_radians(run.streams)
     streams = without_nonsense(streams, skipped)
@@ -91,7 +142,10 @@ def solve_session(
     notes += _wheel_notes(motion)
     if not motion.gyro:
         notes.append("no IMU: turns rest on the wheels, the slope on GNSS and trunks")
-    detections, track, moving = _screened(_covered(Detections.of(run.trunks), motion, notes), motion, config, notes)
+    detections = _covered(Detections.of(run.trunks), motion, notes)
+    track, moving = np.arange(len(detections)), 0.0
+    if screened:
+        detections, track, moving = _screened(detections, motion, config, notes)
     n_fix = len(run.streams.fix_ns)
     used = np.ones(n_fix, bool)
     if check_fixes > 0:
@@ -124,25 +178,8 @@ def solve_session(
     notes += said
     if known is not None:
         problem = replace(problem, known=known.at(detections))
-    seconds = {"read": run.seconds}
-    decided, estimate, loops = associate_and_solve(problem, track, config, progress)
-    problem = decided.problem
-    seconds["associate and solve"] = time.perf_counter() - began
-    return Solved(
-        run=run,
-        streams=streams,
-        motion=motion,
-        detections=problem.detections,
-        problem=problem,
-        estimate=estimate,
-        tree=decided.tree,
-        existence=decided.existence,
-        shapes=decided.shapes,
-        held_out=np.flatnonzero(~used),
-        rejected=decided.rejected,
-        loops=loops,
-        moving=moving,
-        seconds=seconds,
+    return Prepared(
+        run=run, streams=streams, problem=problem, track=track, moving=moving, held_out=np.flatnonzero(~used)
     )
 
 

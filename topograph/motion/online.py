@@ -50,6 +50,10 @@ LEVEL_SIGMA = 0.01
 """Roll and pitch as gravity holds them over time, rad."""
 MOVING_SIGMA = 0.06
 """The same from less than a second of a drive, rad: the suspension's own accelerations."""
+FASTEST_TURN = 3.0
+"""No robot that drives in an orchard turns faster, rad/s; a gyro that says so speaks in degrees, or is broken."""
+LEVEL_NS = 1_500_000_000
+"""So long after the last IMU sample the attitude is still worth something: a robot turns around at the end of a row within seconds."""
 
 
 _M = TypeVar("_M", tuple[int, Array], tuple[int, Array, Array])
@@ -193,7 +197,8 @@ class Reckoner:
         doubt = self._against.take(
             float(step[2]), told, self._against.scale * step[:2], 0.0 if blind or first else seconds
         )
-        if gyro and self._against.gyro_is_wrong:
+        too_fast = not blind and abs(float(step[2])) > FASTEST_TURN * max(seconds, 0.1)
+        if gyro and (self._against.gyro_is_wrong or too_fast):
             gyro, (step, up, distance, turned) = False, by_wheels
         scale = np.array([self._against.scale, self._against.scale, 1.0])
         step, up, distance = step * scale, up * scale[0], distance * scale[0]
@@ -202,8 +207,12 @@ class Reckoner:
             self._drift_cov[:] = np.diag([HALF_TURN**2, self._drift_cov[1, 1]])
         return Leg(
             step=step, up=up, distance=distance, turned=turned, seconds=seconds, blind=blind, gyro=gyro,
-            rate_sigma=float(np.hypot(min(np.sqrt(self._drift_cov[1, 1]), USUAL_BIAS), doubt)), level=self._attitude is not None, **tilt,
+            rate_sigma=float(np.hypot(min(np.sqrt(self._drift_cov[1, 1]), USUAL_BIAS), doubt)), level=self._is_level(stamp_ns), **tilt,
         )  # fmt: skip
+
+    def _is_level(self, stamp_ns: int) -> bool:
+        """Roll and pitch are known: the IMU still speaks."""
+        return self._attitude is not None and self._sample is not None and stamp_ns - self._sample[0] < LEVEL_NS
 
     def restart(self, stamp_ns: int) -> None:
         """All clocks were set back: motion begins anew at `stamp_ns`; what was learnt of the sensors stays."""

@@ -5,10 +5,12 @@ from topograph.pipeline.auditing import audited
 from topograph.pipeline.inspecting import Inspection, Role, inspect_bags
 from topograph.pipeline.localizing import Replay, localize_bags
 from topograph.pipeline.mapping import (
+    averaged,
     baseline,
     extend,
     residual_metrics,
     solve_run,
+    thesis_map,
     topo_map,
     why_no_trees,
 )
@@ -24,6 +26,7 @@ __all__ = [
     "Role",
     "Solved",
     "audited",
+    "averaged",
     "baseline",
     "extend",
     "has_no_common_gnss",
@@ -38,6 +41,7 @@ __all__ = [
     "residual_metrics",
     "scan_near",
     "solve_run",
+    "thesis_map",
     "topo_map",
     "why_no_trees",
 ]

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from topograph.config import Config
-from topograph.estimate import Estimate, average, path_at
+from topograph.estimate import Estimate, Problem, average, path_at
 from topograph.evaluate import Metric, fix_metrics
-from topograph.geometry import transform
-from topograph.mapping import KnownMap, MappingConfig, Placed, Progress, Solved, map_T_scans, silent, solve_session
+from topograph.geometry import Array, transform
+from topograph.mapping import (
+    KnownMap,
+    MappingConfig,
+    Placed,
+    Prepared,
+    Progress,
+    Solved,
+    map_T_scans,
+    prepare,
+    silent,
+    solve_session,
+)
 from topograph.session import Session
 from topograph.topomap import SessionRecord, TopoMap, build, merge
 from topograph.trees import Existence, in_order, seen_through, shapes
@@ -69,50 +78,68 @@ def topo_map(solved: Solved, config: Config, meta: dict[str, str], *, clouds: bo
 
 def _record(solved: Solved, meta: dict[str, str]) -> SessionRecord:
     """The run as a session of a map."""
-    stamps = solved.estimate.stamps_ns
+    return _record_of(solved.run, solved.estimate, float(solved.motion.distance[-1]), meta)
+
+
+def _record_of(run: Session, e: Estimate, distance: float, meta: dict[str, str]) -> SessionRecord:
     return SessionRecord(
-        name=solved.run.id,
-        start_ns=int(stamps[0]),
-        end_ns=int(stamps[-1]),
-        distance=float(solved.motion.distance[-1]),
+        name=run.id,
+        start_ns=int(e.stamps_ns[0]),
+        end_ns=int(e.stamps_ns[-1]),
+        distance=distance,
         inputs=meta.get("inputs", "[]"),
         verdict=meta.get("verdict", ""),
     )
 
 
-def baseline(solved: Solved, config: Config) -> tuple[Estimate, TopoMap]:
-    """The thesis's map of the same detections: Algorithm 3 with filtered poses, nodes with few sightings left out.
-
-    The thesis kept every node; without a bound each false detection would be a tree. The same bound as ours is used.
-    """
-    e = average.solve(solved.problem, config.estimate)
-    hits = np.bincount(e.tree[e.tree >= 0], minlength=len(e.trees))
-    keep = hits >= config.trees.min_sightings
-    name = np.where(keep, np.cumsum(keep) - 1, -1)
-    tree = np.where(e.tree >= 0, name[np.maximum(e.tree, 0)], -1)
-    e = replace(e, trees=e.trees[keep], tree_cov=e.tree_cov[keep], tree=tree)
-    poses = path_at(e.stamps_ns, e.map_T_robot, solved.motion, solved.detections.stamps_ns)
-    n = int(keep.sum())
+def averaged(
+    problem: Problem,
+    run: Session,
+    config: Config,
+    meta: dict[str, str],
+    *,
+    path: Array | None = None,
+    clouds: bool = True,
+) -> tuple[Estimate, TopoMap]:
+    """The thesis's map (Algorithm 3) of a problem's detections, with poses of the filter, or a `path` (K, 4, 4) at the keyframes."""
+    e = average.solve(problem, config.average, path)
+    d = problem.detections
+    poses = path_at(e.stamps_ns, e.map_T_robot, problem.motion, d.stamps_ns)
+    n = len(e.trees)
     all_trees = Existence(
         ok=np.ones(n, bool),
         kind=np.zeros(n, np.int64),
         probability=np.full(n, np.nan),
         score=np.zeros(n),
-        hits=hits[keep],
+        hits=np.bincount(e.tree[e.tree >= 0], minlength=n),
         passed=np.zeros(n, np.int64),
     )
     topo = build(
         e,
-        solved.detections,
-        [],
+        d,
+        in_order(run.trunks) if clouds else [],
         poses,
         all_trees,
-        shapes(solved.detections, tree, poses, n),
-        solved.problem.datum,
+        shapes(d, e.tree, poses, n),
+        problem.datum,
         config.topomap,
-        {"method": "thesis"},
+        {**meta, "method": "thesis"},
+        _record_of(run, e, float(problem.motion.distance[-1]), meta),
     )
     return e, topo
+
+
+def baseline(solved: Solved, config: Config) -> tuple[Estimate, TopoMap]:
+    """The thesis's map of the same detections as the graph had, without clouds."""
+    return averaged(solved.problem, solved.run, config, {}, clouds=False)
+
+
+def thesis_map(
+    run: Session, config: Config, meta: dict[str, str], *, check_fixes: int = 0
+) -> tuple[Prepared, Estimate, TopoMap]:
+    """The thesis's map of a run: all that its front end found, filtered poses, Algorithm 3, viewpoint clouds. No graph is solved."""
+    p = prepare(run, mapping_config(config), check_fixes=check_fixes, screened=False)
+    return (p, *averaged(p.problem, run, config, meta))
 
 
 def residual_metrics(solved: Solved) -> list[Metric]:

@@ -1,6 +1,7 @@
 """Estimate + scans -> TopoMap: nodes with viewpoint clouds, edges, rows. No solver, no files."""
 
 from topograph.topomap.build import build
+from topograph.topomap.clouds import Query, Target
 from topograph.topomap.edges import TopomapConfig, neighbours
 from topograph.topomap.map import KINDS, TopoMap, Viewpoint
 from topograph.topomap.merge import merge
@@ -9,8 +10,10 @@ from topograph.topomap.sessions import Seen, SessionRecord
 
 __all__ = [
     "KINDS",
+    "Query",
     "Seen",
     "SessionRecord",
+    "Target",
     "TopoMap",
     "TopomapConfig",
     "Viewpoint",

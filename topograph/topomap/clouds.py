@@ -45,6 +45,46 @@ def register(clouds: list[NDArray[np.float32]], voxel: float) -> NDArray[np.floa
     return thin(whole, voxel)
 
 
+class Query:
+    """A cloud (N, 3) that is registered onto others, from its centroid on (thesis 3.2, Algorithm 5)."""
+
+    def __init__(self, cloud: NDArray[np.float32]) -> None:
+        from small_gicp import PointCloud
+
+        some = np.asarray(cloud, float)[:: max(len(cloud) // MOST, 1)]
+        self.points = some - some.mean(0)
+        self.cloud = PointCloud(self.points)
+
+    def fitness(self, target: Target, turn: float = 0.0) -> float:
+        """Mean squared distance to the target's cloud after registration that begins `turn` rad about the vertical, m²."""
+        from small_gicp import align
+
+        begin = np.eye(4)
+        begin[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+
+        r = align(
+            target.cloud, self.cloud, target.tree, begin, registration_type="ICP",
+            max_correspondence_distance=APART, max_iterations=ITERATIONS,
+        )  # fmt: skip
+        T = r.T_target_source
+        _, squared = target.tree.batch_nearest_neighbor_search(self.points @ T[:3, :3].T + T[:3, 3])
+        return float(np.mean(squared))
+
+
+class Target:
+    """A cloud (N, 3) about its centroid that others are registered onto."""
+
+    def __init__(self, cloud: NDArray[np.float32]) -> None:
+        from small_gicp import KdTree, PointCloud
+
+        self.cloud = PointCloud(np.asarray(cloud, float) - cloud.mean(0))
+        self.tree = KdTree(self.cloud)
+
+
+APART = 1.0
+"""Farther points of two trunks about their centroids do not belong together, m."""
+
+
 def thin(points: Array, voxel: float) -> NDArray[np.float32]:
     """The mean of the points in each voxel (M, 3)."""
     key = np.floor(points / voxel).astype(np.int64)

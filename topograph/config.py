@@ -57,17 +57,41 @@ def load(path: Path | None, overrides: dict[str, Any] | None = None) -> Config:
     Raises:
         UsageError: the file is missing, not YAML, or has an unknown key or a value of the wrong kind.
     """
-    data: dict[str, Any] = {}
-    if path is not None:
-        try:
-            data = yaml.load(path.read_text(), _Loader) or {}  # noqa: S506  # a subclass of the safe loader
-        except (OSError, yaml.YAMLError) as err:
-            raise UsageError(f"{path}: cannot be read as YAML ({err})") from err
-        if not isinstance(data, dict):
-            raise UsageError(f"{path}: a configuration is a mapping of rooms; see `topograph config`")
+    data = {} if path is None else _read(path)
     for key, value in (overrides or {}).items():
         room, _, name = key.partition(".")
         data.setdefault(room, {})[name] = value
+    return from_dict(data)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if not path.exists() and str(path) in PRESETS:
+        path = preset(str(path))
+    try:
+        data = yaml.load(path.read_text(), _Loader) or {}  # noqa: S506  # a subclass of the safe loader
+    except (OSError, yaml.YAMLError) as err:
+        raise UsageError(f"{path}: cannot be read as YAML ({err})") from err
+    if not isinstance(data, dict):
+        raise UsageError(f"{path}: a configuration is a mapping of rooms; see `topograph config`")
+    return data
+
+
+PRESETS = ("thesis", "thesis_best")
+"""Configurations that come with the program; a name stands for the file."""
+
+
+def preset(name: str) -> Path:
+    """The file of a preset: in the wheel beside this module, in a checkout in configs/."""
+    here = Path(__file__).parent
+    inside = here / "configs" / f"{name}.yaml"
+    return inside if inside.exists() else here.parent / "configs" / f"{name}.yaml"
+
+
+def over(config: Config, name: str) -> Config:
+    """A configuration with what a preset sets laid over it."""
+    data = _plain(asdict(config))
+    for room, block in _read(preset(name)).items():
+        data[room] = {**data[room], **block}
     return from_dict(data)
 
 

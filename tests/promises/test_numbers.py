@@ -13,7 +13,7 @@ from topograph.config import Config
 from topograph.estimate import Headings
 from topograph.estimate.ekf import filtered_path
 from topograph.estimate.inertia import inertia
-from topograph.evaluate import Metric, Truth, map_metrics
+from topograph.evaluate import Metric, Truth, map_metrics, world_in_map
 from topograph.evaluate.localization import localization_errors, path_errors
 from topograph.evaluate.metrics import match
 from topograph.geometry import Array, Datum, interpolate, inverse, planar, transform, wrap, yaw_of
@@ -274,7 +274,7 @@ def test_poses_of_a_later_run_are_as_sure_as_is_said(rtk: list[Mapped], folder: 
         )
         replay = localize_bags(m.topo, [path], Config())
         assert m.topo.datum is not None
-        errors = localization_errors(replay.reports, truth, m.topo.datum)
+        errors = localization_errors(replay.reports, truth, world_in_map(m.topo, truth))
         assert len(errors.xy) > 0.8 * len(replay.reports)
         for r in replay.reports:
             if r.fix is not None and np.isfinite(r.along):
@@ -282,7 +282,7 @@ def test_poses_of_a_later_run_are_as_sure_as_is_said(rtk: list[Mapped], folder: 
                 assert np.sort([r.along**2, r.across**2])[1] <= spread[1] + 1e-3
         nees.append(errors.nees.mean())
         live.append(np.linalg.norm(errors.xy, axis=1).mean())
-        smoothed.append(path_errors(*replay.smoothed, truth, m.topo.datum).mean())
+        smoothed.append(path_errors(*replay.smoothed, truth, world_in_map(m.topo, truth)).mean())
     assert 0.3 < np.mean(nees) < 4.5
     assert np.mean(live) < 0.04
     assert np.mean(smoothed) < 0.95 * np.mean(live)

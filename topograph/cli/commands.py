@@ -14,6 +14,7 @@ import numpy as np
 
 from topograph import __version__
 from topograph.cli.common import (
+    TRUTH,
     check_accepted,
     check_target,
     config_of,
@@ -45,7 +46,7 @@ from topograph.errors import InputError, MapError, UsageError
     help="Save the map though the audit refuses it for NAME; repeat for more.",
 )
 @click.option("--results", type=click.Path(path_type=Path), help="Folder for path, report and configuration.")
-@click.option("--truth", type=click.Path(path_type=Path), help="Folder of simulated truth to compare with.")
+@click.option("--truth", multiple=True, type=click.Path(path_type=Path), help=TRUTH)
 @click.option("--check-fixes", type=click.IntRange(0), default=0, metavar="N",
               help="Withhold every N-th fix from the estimator and report the path's distance from it (1: withhold all).")  # fmt: skip
 @click.option("--from", "from_s", type=float, default=0.0, help="Begin so many seconds into the recording.")
@@ -61,7 +62,7 @@ from topograph.errors import InputError, MapError, UsageError
 @input_options
 def map_command(
     bags: tuple[Path, ...], output: Path | None, force: bool, method: str, into: Path | None, accept: tuple[str, ...], results: Path | None,
-    truth: Path | None, check_fixes: int, from_s: float, to_s: float, jobs: int, quiet: bool, config_file: Path | None,
+    truth: tuple[Path, ...], check_fixes: int, from_s: float, to_s: float, jobs: int, quiet: bool, config_file: Path | None,
     **words: Any,
 ) -> None:  # fmt: skip
     """Make a map of the trees in BAGS (one run)."""
@@ -116,7 +117,7 @@ def save_thesis(
     from topograph import pipeline, report, store
     from topograph.config import dump
     from topograph.errors import InsufficientDataError
-    from topograph.evaluate import truth_metrics, write_tum
+    from topograph.evaluate import truth_metrics, world_in_map, write_tum
     from topograph.evaluate.metrics import doubles
     from topograph.report.record import write_text
 
@@ -128,9 +129,8 @@ def save_thesis(
     metrics = [doubles(topo)] if true is None else truth_metrics(topo, e.stamps_ns, e.map_T_robot, true)
     write_tum(folder / "path.tum", e.stamps_ns, e.map_T_robot)
     write_text(folder / "config.yaml", text)
-    picture = report.map_figure(
-        topo, true.trees_in(topo.datum) if true is not None and topo.datum is not None else None
-    )
+    true_trees = world_in_map(topo, true).points(true.trees) if true is not None and len(true.trees) else None
+    picture = report.map_figure(topo, true_trees)
     (folder / "map.png").write_bytes(picture)
     store.save(topo, target)
     report.write_json(
@@ -177,7 +177,7 @@ def save_results(
 
     from topograph import pipeline, report, store
     from topograph.config import dump
-    from topograph.evaluate import truth_metrics, write_tum
+    from topograph.evaluate import truth_metrics, world_in_map, write_tum
     from topograph.evaluate.metrics import doubles, tree_errors
     from topograph.report.record import write_text
 
@@ -196,8 +196,8 @@ def save_results(
     if true is not None:
         e = solved.estimate
         metrics = truth_metrics(topo, e.stamps_ns, e.map_T_robot, true) + metrics
-        true_trees = true.trees_in(topo.datum) if topo.datum is not None else None
-        _, _, error = tree_errors(topo, true)
+        true_trees = world_in_map(topo, true).points(true.trees) if len(true.trees) else None
+        error = tree_errors(topo, true)[2] if len(true.trees) else np.zeros((0, 3))
         if len(error):
             figures["Errors of the trees"] = report.tree_error_figure(np.linalg.norm(error[:, :2], axis=1))
     else:
@@ -237,13 +237,13 @@ def save_results(
 
 @main.command()
 @click.argument("bags", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--truth", type=click.Path(path_type=Path), help="Folder of simulated truth to compare with.")
+@click.option("--truth", multiple=True, type=click.Path(path_type=Path), help=TRUTH)
 @click.option("--results", type=click.Path(path_type=Path), help="Folder for the figure and report.json.")
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 @input_options
 def compare(
     bags: tuple[Path, ...],
-    truth: Path | None,
+    truth: tuple[Path, ...],
     results: Path | None,
     quiet: bool,
     config_file: Path | None,
@@ -297,11 +297,7 @@ def compare(
     default=None,
     help="Seconds into the run of the scan that is drawn (default: the middle).",
 )
-@click.option(
-    "--truth",
-    type=click.Path(path_type=Path),
-    help="Folder of simulated truth: precision and recall by range.",
-)
+@click.option("--truth", multiple=True, type=click.Path(path_type=Path), help=TRUTH)
 @click.option("--results", type=click.Path(path_type=Path), help="Folder for report.json.")
 @click.option(
     "--jobs",
@@ -313,7 +309,7 @@ def compare(
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 @input_options
 def detect(
-    bags: tuple[Path, ...], csv_file: Path | None, picture: Path | None, at_s: float | None, truth: Path | None,
+    bags: tuple[Path, ...], csv_file: Path | None, picture: Path | None, at_s: float | None, truth: tuple[Path, ...],
     results: Path | None, jobs: int, quiet: bool, config_file: Path | None, **words: Any,
 ) -> None:  # fmt: skip
     """Find trunks in the scans of BAGS: counts, rate, a table by range, a picture."""
@@ -324,6 +320,10 @@ def detect(
 
     config = config_of(config_file, words)
     true = truth_of(truth)
+    if true is not None and (not len(true.returns) or not len(true.trees)):
+        raise UsageError(
+            "detect --truth needs a simulator's folder: it says how many returns each sweep had of each trunk"
+        )
     with ExitStack() as stack:
         hashes = stack.enter_context(hashed(bags if results is not None else ()))
         progress = stack.enter_context(progress_bar(quiet))
@@ -403,6 +403,9 @@ def detect(
 @click.option("--rings", type=click.Choice(["16", "32", "64", "128"]), default="16", show_default=True)
 @click.option("--sweep-hz", type=float, default=10.0, show_default=True)
 @click.option("--stop-every", type=float, default=0.0, help="Stop and go, as in the thesis: metres between stops.")
+@click.option(
+    "--scans-at-stops", is_flag=True, help="Clouds only while the robot stands, two a second (with --stop-every)."
+)
 @click.option("--longest", type=float, default=3600.0, help="Cut the drive after so many seconds.")
 @click.option("--laps", type=int, default=1)
 @click.option("--compression", type=click.Choice(["none", "lz4", "zstd"]), default="none")
@@ -410,19 +413,21 @@ def detect(
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 def simulate(
     output: Path, design: str, seed: int, number: int, gnss: str, rings: str, sweep_hz: float, stop_every: float,
-    longest: float, laps: int, compression: str, detections: bool, quiet: bool,
+    scans_at_stops: bool, longest: float, laps: int, compression: str, detections: bool, quiet: bool,
 ) -> None:  # fmt: skip
     """Write a simulated run to OUTPUT (.bag: ROS 1; otherwise a ROS 2 folder with mcap), truth in <OUTPUT>.truth."""
     from topograph.simulate import DESIGNS, DriveConfig, SensorConfig, record
 
     if design not in DESIGNS:
         raise UsageError(f"--design {design}: known are {', '.join(DESIGNS)}")
+    if scans_at_stops and stop_every <= 0:
+        raise UsageError("--scans-at-stops needs --stop-every METRES")
     if (compression == "lz4" and output.suffix != ".bag") or (compression == "zstd" and output.suffix == ".bag"):
         raise UsageError(f"--compression {compression}: lz4 is for .bag, zstd for mcap")
     sensor = SensorConfig(
         gnss=gnss, rings=int(rings), sweep_hz=sweep_hz, detections=detections, compression=compression
     )
-    drive = DriveConfig(run=number, stop_every=stop_every, longest_s=longest, laps=laps)
+    drive = DriveConfig(run=number, stop_every=stop_every, scans_at_stops=scans_at_stops, longest_s=longest, laps=laps)
     with progress_bar(quiet) as progress:
         truth = record(output, seed, design, drive, sensor, progress=lambda share: progress("simulate", share))
     span = (truth.stamps_ns[-1] - truth.stamps_ns[0]) * 1e-9
@@ -468,7 +473,7 @@ def demo(context: click.Context, folder: Path, seed: int, quiet: bool) -> None:
     click.echo("the later run, localized in this map:")
     context.invoke(
         localize, map_file=folder / "orchard.gpkg", bags=(later,), results=folder / "localization",
-        truth=folder / "run3.truth", quiet=quiet,
+        truth=(folder / "run3.truth",), quiet=quiet,
     )  # fmt: skip
     click.echo(f"look at {folder / 'report.html'} (browser), {folder / 'orchard.gpkg'} (QGIS), {folder / 'map.png'}")
 

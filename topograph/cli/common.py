@@ -243,11 +243,16 @@ def peak_mb() -> float:
     return peak / 1024 if sys.platform != "darwin" else peak / 1024**2
 
 
-def truth_of(folder: Path | None) -> Any:
-    """The truth that was named; none is looked for: an estimator must not find it by itself."""
-    from topograph.evaluate import Truth
+TRUTH = (
+    "Truth to compare with: a simulator's folder, a .tum path, or trees as .csv or .geojson; twice for trees and path."
+)
 
-    return None if folder is None else Truth.load(folder)
+
+def truth_of(paths: Sequence[Path]) -> Any:
+    """The truth that was named; none is looked for: an estimator must not find it by itself."""
+    from topograph.evaluate import read_truth
+
+    return read_truth(paths)
 
 
 def table(metrics: Sequence[Any]) -> None:

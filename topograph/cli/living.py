@@ -11,6 +11,7 @@ import numpy as np
 
 from topograph.cli.commands import save_results, say_verdict
 from topograph.cli.common import (
+    TRUTH,
     check_accepted,
     check_target,
     config_of,
@@ -40,12 +41,12 @@ from topograph.errors import UsageError
 @click.option("--from", "from_s", type=float, default=0.0, help="Begin so many seconds into the recording.")
 @click.option("--to", "to_s", type=float, default=float("inf"), help="End there.")
 @click.option("--results", type=click.Path(path_type=Path), help="Folder for path, report and configuration.")
-@click.option("--truth", type=click.Path(path_type=Path), help="Folder of simulated truth to compare with.")
+@click.option("--truth", multiple=True, type=click.Path(path_type=Path), help=TRUTH)
 @click.option("-q", "--quiet", is_flag=True, help="Say nothing on the way.")
 @input_options
 def live(
     bags: tuple[Path, ...], output: Path | None, force: bool, speed: float, every: float, accept: tuple[str, ...], from_s: float,
-    to_s: float, results: Path | None, truth: Path | None, quiet: bool, config_file: Path | None, **words: Any,
+    to_s: float, results: Path | None, truth: tuple[Path, ...], quiet: bool, config_file: Path | None, **words: Any,
 ) -> None:  # fmt: skip
     """Play BAG as if it were driven now: without a MAP (.gpkg) it maps, with one it localizes in it. At the end the map, of this run or
     of MAP with this run in it, is written to -o; MAP itself stays as it is. Ctrl-C ends the drive there, and the map is made.

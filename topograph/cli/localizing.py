@@ -12,6 +12,7 @@ import numpy as np
 
 from topograph import __version__
 from topograph.cli.common import (
+    TRUTH,
     config_of,
     hashed,
     input_options,
@@ -40,17 +41,17 @@ from topograph.errors import UsageError
 @click.option("--from", "from_s", type=float, default=0.0, help="Begin so many seconds into the recording.")
 @click.option("--to", "to_s", type=float, default=float("inf"), help="End there.")
 @click.option("--results", type=click.Path(path_type=Path), help="Folder for poses, table, report and configuration.")
-@click.option("--truth", type=click.Path(path_type=Path), help="Folder of simulated truth to compare with.")
+@click.option("--truth", multiple=True, type=click.Path(path_type=Path), help=TRUTH)
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 @input_options
 def localize(
     map_file: Path, bags: tuple[Path, ...], method: str, risk: float | None, measure: str | None, from_s: float, to_s: float, results: Path | None,
-    truth: Path | None, quiet: bool, config_file: Path | None, **words: Any,
+    truth: tuple[Path, ...], quiet: bool, config_file: Path | None, **words: Any,
 ) -> None:  # fmt: skip
     """Find the robot of BAGS (one run) in MAP, from anywhere, without GNSS; no pose is given where it is not sure."""
     from topograph import pipeline, store
     from topograph.config import dump
-    from topograph.evaluate import write_tum
+    from topograph.evaluate import world_in_map, write_tum
     from topograph.evaluate.localization import localization_errors, localization_metrics, path_errors
     from topograph.evaluate.metrics import Metric
     from topograph.report import localization_error_figure, localization_figure, write_json, write_page
@@ -66,8 +67,7 @@ def localize(
     say_if_cold(quiet)
     true = truth_of(truth)
     topo = store.load(map_file, clouds=method != "graph")
-    if true is not None and topo.datum is None:
-        raise UsageError("--truth needs a georeferenced map: without a datum the two frames have nothing in common")
+    world = None if true is None else world_in_map(topo, true)
     with results_folder(results) as folder, hashed((map_file, *bags)) as hashes:
         with progress_bar(quiet) as progress:
             first = "thesis" if method == "thesis" else "graph"
@@ -75,16 +75,14 @@ def localize(
             other = None
             if method == "both":
                 other = pipeline.localize_bags(topo, bags, config, "thesis", progress, (from_s, to_s))
-        errors = None if true is None or topo.datum is None else localization_errors(run.reports, true, topo.datum)
+        errors = None if true is None or world is None else localization_errors(run.reports, true, world)
         metrics = localization_metrics(run.reports, run.distance, run.update_ms, errors)
-        if true is not None and topo.datum is not None and len(run.smoothed[0]):
-            off = path_errors(*run.smoothed, true, topo.datum)
-            metrics.append(Metric("smoothed: position error mean", float(off.mean()), "m", "lower"))
+        if true is not None and world is not None:
+            off = path_errors(*run.smoothed, true, world)
+            metrics += [Metric("smoothed: position error mean", float(off.mean()), "m", "lower")] if len(off) else []
         by_method = {} if errors is None else {first: errors}
         if other is not None:
-            theirs = (
-                None if true is None or topo.datum is None else localization_errors(other.reports, true, topo.datum)
-            )
+            theirs = None if true is None or world is None else localization_errors(other.reports, true, world)
             by_method |= {} if theirs is None else {"thesis": theirs}
             found = localization_metrics(other.reports, other.distance, other.update_ms, theirs)
             metrics += [replace(m, name=f"thesis: {m.name}") for m in found]

@@ -58,13 +58,17 @@ def solve(problem: Problem, config: AverageConfig, path: Array | None = None) ->
         R = poses[:, :3, :3]
         cov = (R @ d.cov @ R.transpose(0, 2, 1))[:, :2, :2]
         weight = 2.0 / np.maximum(np.trace(cov, axis1=1, axis2=2), 1e-8)
-    nodes, tree = _nodes(seen, weight, config)
-    hits = np.bincount(tree, minlength=len(nodes))
+    # The thesis's trunks have no score: what ours doubts is left out, which is kinder than to make a node of each.
+    sure = np.flatnonzero(d.score >= 0)
+    nodes, of = _nodes(seen[sure], weight[sure], config)
+    tree = np.full(len(d), -1, np.int64)
+    tree[sure] = of
+    hits = np.bincount(of, minlength=len(nodes))
     keep = hits >= config.least
     name = np.where(keep, np.cumsum(keep) - 1, -1)
     return Estimate(
         problem.stamps_ns, path, nodes[keep], np.full((int(keep.sum()), 3, 3), np.nan), None, np.full((3, 3), np.nan),
-        name[tree] if len(tree) else tree, np.ones(0), {}, {}, time.perf_counter() - began,
+        np.where(tree >= 0, name[tree], -1) if len(nodes) else tree, np.ones(0), {}, {}, time.perf_counter() - began,
     )  # fmt: skip
 
 

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from topograph.evaluate.frames import WorldInMap
 from topograph.evaluate.metrics import Metric
 from topograph.evaluate.truth import Truth
-from topograph.geometry import Array, Datum, Stamps, interpolate, wrap, yaw_of
+from topograph.geometry import Array, Stamps, interpolate, wrap, yaw_of
 from topograph.localize import Report
 
 WRONG = 1.0
@@ -27,27 +28,41 @@ class LocalizationErrors:
     nees: Array
 
 
-def localization_errors(reports: Sequence[Report], truth: Truth, datum: Datum) -> LocalizationErrors:
-    """Errors of committed poses in the map's frame at `datum`, against the truth's path."""
-    fixes = [r.fix for r in reports if r.fix is not None]
+def localization_errors(reports: Sequence[Report], truth: Truth, world: WorldInMap) -> LocalizationErrors:
+    """Errors of committed poses against the truth's path, which `world` brings into the map; those that it covers."""
+    fixes = [r.fix for r in reports if r.fix is not None and covered(truth, r.fix.stamp_ns)]
     if not fixes:
         return LocalizationErrors(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0))
     stamps = np.array([f.stamp_ns for f in fixes], np.int64)
     world_T_robot = interpolate(truth.stamps_ns, truth.world_T_robot, stamps)
-    true = datum.to_enu(truth.datum.to_geodetic(world_T_robot[:, :3, 3]))
+    true = world.points(world_T_robot[:, :3, 3])
     poses = np.array([f.map_T_robot for f in fixes])
     error = poses[:, :3, 3] - true
     cov = np.array([f.cov[3:5, 3:5] for f in fixes])
     nees = np.full(len(fixes), np.nan)
     known = np.isfinite(cov).all(axis=(1, 2))
     nees[known] = np.einsum("ki,kij,kj->k", error[known, :2], np.linalg.inv(cov[known]), error[known, :2])
-    return LocalizationErrors(stamps, error[:, :2], error[:, 2], wrap(yaw_of(poses) - yaw_of(world_T_robot)), nees)
+    return LocalizationErrors(
+        stamps, error[:, :2], error[:, 2], wrap(yaw_of(poses) - yaw_of(world_T_robot) - world.turn), nees
+    )
 
 
-def path_errors(stamps_ns: Stamps, poses: Array, truth: Truth, datum: Datum) -> Array:
-    """Horizontal distances (K,) of poses (K, 4, 4) in the map's frame at `datum` from the truth's path, m."""
-    true = interpolate(truth.stamps_ns, truth.world_T_robot, stamps_ns)[:, :3, 3]
-    return np.asarray(np.linalg.norm((poses[:, :3, 3] - datum.to_enu(truth.datum.to_geodetic(true)))[:, :2], axis=1))
+COVER_NS = 20_000_000
+
+
+def covered(truth: Truth, stamp_ns: int) -> bool:
+    """The truth's path says where the robot was then."""
+    ns = truth.stamps_ns
+    return len(ns) > 1 and bool(ns[0] - COVER_NS <= stamp_ns <= ns[-1] + COVER_NS)
+
+
+def path_errors(stamps_ns: Stamps, poses: Array, truth: Truth, world: WorldInMap) -> Array:
+    """Horizontal distances (K,) of poses (N, 4, 4) in the map from the truth's path, m, of those that it covers."""
+    inside = np.array([covered(truth, int(s)) for s in stamps_ns], bool)
+    if not inside.any():
+        return np.zeros(0)
+    true = interpolate(truth.stamps_ns, truth.world_T_robot, stamps_ns[inside])[:, :3, 3]
+    return np.asarray(np.linalg.norm((poses[inside, :3, 3] - world.points(true))[:, :2], axis=1))
 
 
 def localization_metrics(
@@ -71,6 +86,8 @@ def localization_metrics(
     wrong = off > WRONG
     out += [
         Metric("position error mean", float(off.mean()), "m", "lower"),
+        Metric("|x| error mean", float(np.abs(errors.xy[:, 0]).mean()), "m", "lower"),
+        Metric("|y| error mean", float(np.abs(errors.xy[:, 1]).mean()), "m", "lower"),
         Metric("position error 99 %", float(np.percentile(off, 99)), "m", "lower"),
         Metric("position error max", float(off.max()), "m", "lower"),
         Metric("heading error mean", float(yaw.mean()), "deg", "lower"),

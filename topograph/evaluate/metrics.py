@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
+from topograph.evaluate.frames import world_in_map
 from topograph.evaluate.truth import Truth
 from topograph.geometry import Array, Datum, Stamps, align_se3, interpolate, inverse, log, transform
 from topograph.topomap import TopoMap
@@ -50,27 +51,21 @@ def visible(truth: Truth, least: int = 8) -> NDArray[np.bool_]:
     return np.asarray((truth.returns >= 5).sum(axis=0) >= least)
 
 
-def tree_errors(topo: TopoMap, truth: Truth) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Matched rows of the map's trees and of the truth, and errors (M, 3) in the map frame, m.
-
-    A georeferenced map is compared through WGS84. A local one is first laid onto the truth by its path.
-    """
+def tree_errors(
+    topo: TopoMap, truth: Truth, gate: float = MATCH_GATE
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Matched rows of the map's trees and of the truth, and errors (M, 3) of the feet in the map frame, m; see `world_in_map`."""
     topo = topo.trees()
-    true = _in_map(topo, truth, truth.trees)
-    i, j = match(topo.p[:, :2], true[:, :2])
+    true = world_in_map(topo, truth).points(truth.trees)
+    i, j = match(topo.p[:, :2], true[:, :2], gate)
     return i, j, topo.p[i] - true[j]
-
-
-def _in_map(topo: TopoMap, truth: Truth, world_p: Array) -> Array:
-    if topo.datum is not None:
-        return topo.datum.to_enu(truth.datum.to_geodetic(world_p))
-    true_path = interpolate(truth.stamps_ns, truth.world_T_robot, topo.stamps_ns)[:, :3, 3]
-    return transform(align_se3(true_path, topo.map_T_robot[:, :3, 3]), world_p)
 
 
 def map_metrics(topo: TopoMap, truth: Truth) -> list[Metric]:
     """Precision, recall, errors, doubles, diameters, consistency of the covariances."""
     topo = topo.trees()
+    if not len(truth.trees):
+        return [Metric("trees", len(topo)), doubles(topo)]
     i, j, e = tree_errors(topo, truth)
     error = np.linalg.norm(e[:, :2], axis=1)
     seen = visible(truth)
@@ -80,7 +75,7 @@ def map_metrics(topo: TopoMap, truth: Truth) -> list[Metric]:
         Metric("tree recall", float(seen[j].sum() / max(seen.sum(), 1)), "", "higher"),
     ]
     if len(i):
-        d = topo.diameter[i] - truth.diameters[j]
+        d = topo.diameter[i] - truth.diameters[j]  # NaN where the truth has none
         single = (truth.stems[j] == 1) & np.isfinite(d)
         out += [
             Metric("tree error mean", float(error.mean()), "m", "lower"),
@@ -115,6 +110,8 @@ def path_metrics(
     true_datum: Datum | None,
 ) -> list[Metric]:
     """Error of a path. With both datums known it is compared as it is; else after the best rigid motion (ATE)."""
+    if len(true_ns) < 2:
+        return []
     inside = (stamps_ns >= true_ns[0] - 10_000_000) & (stamps_ns <= true_ns[-1] + 10_000_000)
     if inside.sum() < 3:
         return []

@@ -18,9 +18,10 @@ _COLUMNS = ("id", "lat", "lon", "h", "x", "y", "z", "axis_x", "axis_y", "axis_z"
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """Trees and path in the ENU frame of `datum` ("world").
+    """Trees and path in the ENU frame of `datum` ("world"), or in a local frame. Either may be missing.
 
     Attributes:
+        datum: of the frame; None where it is local.
         trees: (N, 3) where each trunk's axis meets the ground, m.
         axes: (N, 3) unit vectors, up.
         diameters: (N,) at 0.8 m above ground, m.
@@ -29,9 +30,10 @@ class Truth:
         world_T_robot: (M, 4, 4).
         scan_stamps_ns: (S,) of the scans, or empty.
         returns: (S, N) LiDAR returns from each trunk below 1.6 m in each scan, or empty.
+        sigma: the truth's own standard deviation, m; NaN where nobody states it.
     """
 
-    datum: Datum
+    datum: Datum | None
     trees: Array
     axes: Array
     diameters: Array
@@ -40,13 +42,29 @@ class Truth:
     world_T_robot: Array
     scan_stamps_ns: Stamps
     returns: NDArray[np.int32]
+    sigma: float = 0.0
 
-    def trees_in(self, datum: Datum) -> Array:
-        """(N, 3) tree positions in the ENU frame of another datum, m."""
-        return datum.to_enu(self.datum.to_geodetic(self.trees))
+    @staticmethod
+    def of_path(
+        stamps_ns: Stamps, world_T_robot: Array, datum: Datum | None = None, sigma: float = float("nan")
+    ) -> Truth:
+        """A path (M,), (M, 4, 4) alone."""
+        n = np.zeros((0, 3))
+        return Truth(datum, n, n, np.zeros(0), np.zeros(0, np.int64), stamps_ns, world_T_robot, *_no_returns(0), sigma)
+
+    @staticmethod
+    def of_trees(
+        datum: Datum | None, trees: Array, *, axes: Array, diameters: Array, stems: NDArray[np.int64], sigma: float
+    ) -> Truth:
+        """Trees (N, 3) alone."""
+        nowhere = np.zeros((0, 4, 4))
+        return Truth(
+            datum, trees, axes, diameters, stems, np.zeros(0, np.int64), nowhere, *_no_returns(len(trees)), sigma
+        )
 
     def save(self, folder: Path) -> None:
-        """Write `trees.csv`, `path.tum`, `datum.json`, `returns.npz` into `folder`."""
+        """Write `trees.csv`, `path.tum`, `datum.json`, `returns.npz` into `folder`; the frame must be georeferenced."""
+        assert self.datum is not None
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "datum.json").write_text(
             json.dumps({"lat": self.datum.lat, "lon": self.datum.lon, "h": self.datum.h}) + "\n"
@@ -96,6 +114,10 @@ class Truth:
             scans,
             returns,
         )
+
+
+def _no_returns(n: int) -> tuple[Stamps, NDArray[np.int32]]:
+    return np.zeros(0, np.int64), np.zeros((0, n), np.int32)
 
 
 def write_tum(path: Path, stamps_ns: Stamps, poses: Array) -> None:

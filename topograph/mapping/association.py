@@ -164,7 +164,7 @@ def associate_and_solve(
     progress("associate", 1.0)
     a.tree_of_track = a.named(a.closer.tree)
     estimate = a.solve(estimate, patient=True)
-    for n, patience in enumerate((4.0, 2.0, 1.0)):
+    for n, patience in enumerate((4.0, 2.0, 1.0) if config.trees.reassociate else ()):
         progress("refine", n / 3)
         before = a.tree_of_track
         a.tree_of_track = a.named(refine(a.table(estimate), before, config.trees, patience))
@@ -172,7 +172,7 @@ def associate_and_solve(
             estimate = a.solve(estimate, patient=True)
     progress("solve", 0.0)
     after = a.decide(estimate)
-    for n in range(LAST_ROUNDS):
+    for n in range(LAST_ROUNDS if config.trees.reassociate else 1):
         decided = after
         estimate = replace(graph.solve(decided.problem, config.estimate), tree=decided.tree)
         progress("solve", (n + 1) / LAST_ROUNDS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -16,9 +16,9 @@ from topograph.bags import Imu, Odometry, Recording, Trunks
 from topograph.config import Config
 from topograph.errors import InsufficientDataError
 from topograph.geometry import Array
-from topograph.localize import Fix, GraphMethod, Localizer, Move, Report, Sweep, ThesisMethod, smooth
+from topograph.localize import Fix, GraphMethod, Localizer, Method, Move, Report, Sweep, ThesisMethod, smooth
 from topograph.mapping import Progress, silent
-from topograph.pipeline.read import WHOLE, child_mount, refuse_damaged, stream
+from topograph.pipeline.read import WHOLE, Heard, child_mount, refuse_damaged, stream
 from topograph.topomap import TopoMap
 
 
@@ -32,6 +32,7 @@ class Replay:
         smoothed: stamps (K,) and poses (K, 4, 4) of the committed scans, with what came later taken in.
         skipped, notes, chosen: as in mapping.
         seconds: per stage; `update_ms` of each scan.
+        trunks_seen: (S,) trunks nearer than 10 m in each scan.
         exploded: scans in which the thesis's combinations exceeded their cap.
     """
 
@@ -43,6 +44,7 @@ class Replay:
     chosen: dict[str, str] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     update_ms: list[float] = field(default_factory=list)
+    trunks_seen: list[int] = field(default_factory=list)
     duration_s: float = 0.0
     exploded: int = 0
 
@@ -75,39 +77,102 @@ def localize_bags(
             raise InsufficientDataError(
                 "no point cloud and no trunk detections; name one with --topic-points or --topic-trunks"
             )
-        localizer: Localizer | None = None
-        buffer: list[Imu | Odometry] = []
-        stretch = _Stretch()
+        player = _Player(out, lambda heard: _begin(topo, recording, heard, config, method, out.notes))
         for m in stream(recording, config, partial(_show, progress), span_s):
-            if isinstance(m, (Imu, Odometry)):
-                buffer.append(m)
-            elif isinstance(m, Trunks):
-                if localizer is None:
-                    localizer = _begin(topo, recording, buffer, config, method, out.notes)
-                began_one = time.perf_counter()
-                localizer.update(m, buffer)
-                out.update_ms.append(1e3 * (time.perf_counter() - began_one))
-                buffer.clear()
-                report = localizer.report
-                assert report is not None
-                out.reports.append(report)
-                out.distance.append((out.distance[-1] if out.distance else 0.0) + localizer.leg.distance)
-                if isinstance(localizer.method, GraphMethod):
-                    stretch.add(report, localizer.method)
+            player.take(m)
         refuse_damaged(recording)
         out.notes += [*recording.notes, *recording.clocks.notes]
     out.seconds["read, detect and localize"] = time.perf_counter() - began
-    if localizer is None:
-        raise InsufficientDataError("no scan in the recording (or in the part that was asked for)")
-    if isinstance(localizer.method, ThesisMethod):
-        out.exploded = localizer.method.exploded
-    else:
+    player.finish(progress)
+    return out
+
+
+def localize_heard(
+    topo: TopoMap, heard: Heard, config: Config, method: MethodOf, *, first: int = 0, until_committed: bool = False
+) -> Replay:
+    """The same from what was read before: a run is detected once, and localized in many maps by many methods.
+
+    It begins with the scan number `first`; `until_committed`: it ends with the first pose.
+    """
+    out = Replay(duration_s=heard.session.duration_s, chosen=dict(heard.session.chosen))
+    imu = heard.session.mounts.get("imu")
+    child_T_robot, R = heard.session.child_T_robot, None if imu is None else imu[:3, :3]
+    player = _Player(
+        out,
+        lambda _: Localizer(
+            topo, config.localize, child_T_robot=child_T_robot, robot_R_imu=R, method=method(topo, config)
+        ),
+    )
+    scan = -1
+    before: list[Imu | Odometry] = []
+    for m in heard.messages:
+        scan += isinstance(m, Trunks)
+        if scan < first:
+            if not isinstance(m, Trunks):
+                before = [*before[-LEAD:], m]
+            continue
+        for earlier in before:
+            player.take(earlier)
+        before = []
+        player.take(m)
+        if until_committed and out.reports and out.reports[-1].fix is not None:
+            return out
+    player.finish(silent)
+    return out
+
+
+LEAD = 150
+"""Small messages before a start that say how the robot stands and moves."""
+MethodOf = Callable[[TopoMap, Config], Method]
+
+
+class _Player:
+    """Hands messages to a localizer as they come, and keeps what it reports."""
+
+    def __init__(self, out: Replay, begin: Callable[[Sequence[Imu | Odometry]], Localizer]) -> None:
+        self.out, self._begin = out, begin
+        self.localizer: Localizer | None = None
+        self._buffer: list[Imu | Odometry] = []
+        self._stretch = _Stretch()
+
+    def take(self, m: object) -> None:
+        if isinstance(m, (Imu, Odometry)):
+            self._buffer.append(m)
+        if not isinstance(m, Trunks):
+            return
+        if self.localizer is None:
+            self.localizer = self._begin(self._buffer)
+        local, out = self.localizer, self.out
+        began = time.perf_counter()
+        local.update(m, self._buffer)
+        out.update_ms.append(1e3 * (time.perf_counter() - began))
+        self._buffer.clear()
+        assert local.report is not None
+        out.reports.append(local.report)
+        out.trunks_seen.append(int((np.hypot(m.p[:, 0], m.p[:, 1]) < NEAR).sum()) if len(m) else 0)
+        out.distance.append((out.distance[-1] if out.distance else 0.0) + local.leg.distance)
+        if isinstance(local.method, GraphMethod):
+            self._stretch.add(local.report, local.method)
+
+    def finish(self, progress: Progress) -> None:
+        """Smooth what was committed.
+
+        Raises:
+            InsufficientDataError: there was no scan.
+        """
+        if self.localizer is None:
+            raise InsufficientDataError("no scan in the recording (or in the part that was asked for)")
+        if isinstance(self.localizer.method, ThesisMethod):
+            self.out.exploded = self.localizer.method.exploded
         began = time.perf_counter()
         progress("smooth", 0.0)
-        out.smoothed = stretch.solve()
+        self.out.smoothed = self._stretch.solve()
         progress("smooth", 1.0)
-        out.seconds["smooth"] = time.perf_counter() - began
-    return out
+        self.out.seconds["smooth"] = time.perf_counter() - began
+
+
+NEAR = 10.0
+"""Trunks that the thesis's method can use, m (`thesis.view`)."""
 
 
 def _show(progress: Progress, _: str, share: float) -> None:

@@ -92,16 +92,32 @@ def _careful(front_end: FrontEnd, scan: Scan, skipped: Counter[str]) -> Iterator
         log.warning("the scan of %.3f s broke the front end: %r", scan.stamp_ns * 1e-9, err)
 
 
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """A run that was read, and what a localizer hears of it, in the order of the stream."""
+
+    session: Session
+    messages: list[Trunks | Imu | Odometry]
+
+
+def hear(paths: Sequence[Path], config: Config, progress: Progress = silent) -> Heard:
+    """Read and detect a run once, to be mapped and localized in many ways. Raises as `read_run`."""
+    messages: list[Trunks | Imu | Odometry] = []
+    return Heard(read_run(paths, config, progress, keep=messages), messages)
+
+
 def read_run(
     paths: Sequence[Path],
     config: Config,
     progress: Progress = silent,
     span_s: tuple[float, float] = WHOLE,
     jobs: int = 1,
+    keep: list[Trunks | Imu | Odometry] | None = None,
 ) -> Session:
     """Read a run (or `span_s` of it) once: small streams into arrays, scans into trunks as they come.
 
-    With several `jobs`, each process detects in its part of the recording; the result is the same, bit for bit.
+    With several `jobs`, each process detects in its part of the recording; the result is the same, bit for bit. What a localizer would
+    hear is appended to `keep`.
 
     Raises:
         InputError: nothing usable in the bags.
@@ -119,6 +135,8 @@ def read_run(
             trunks = found
         else:
             for product in stream(recording, config, progress, span_s):
+                if keep is not None and isinstance(product, (Trunks, Imu, Odometry)):
+                    keep.append(product)
                 if isinstance(product, Trunks):
                     trunks.append(product)
                 else:

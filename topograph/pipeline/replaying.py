@@ -116,7 +116,7 @@ def live_metrics(played: Played, truth: Truth | None) -> list[Metric]:
         Metric("live: solves' share of a core", sum(s.solve_s for s in states) / max(span, 1e-9), "", "lower"),
     ]
     placed = [s for s in told if s.georeferenced]
-    if truth is None or not placed:
+    if truth is None or truth.datum is None or not placed:
         return out
     true = interpolate(truth.stamps_ns, truth.world_T_robot, np.array([s.stamp_ns for s in placed], np.int64))
     world = truth.datum.to_geodetic(true[:, :3, 3])

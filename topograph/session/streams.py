@@ -40,6 +40,18 @@ class Streams:
     heading_sigma: Array
     frames: dict[str, str]
 
+    def without(self, kind: str) -> Streams:
+        """The streams without one: "odometry", "imu", "fix" or "heading"."""
+        of = {
+            "odometry": ("odometry_ns", "odom_T_child", "twist"),
+            "imu": ("imu_ns", "gyro", "accel"),
+            "fix": ("fix_ns", "lat_lon_h", "fix_cov", "fix_status"),
+            "heading": ("heading_ns", "heading", "heading_sigma"),
+        }[kind]
+        frame = "child" if kind == "odometry" else kind
+        frames = {k: v for k, v in self.frames.items() if k != frame}
+        return replace(self, frames=frames, **{name: getattr(self, name)[:0] for name in of})
+
     def fixes_enu(self) -> Array:
         """All fixes (F, 3) east, north, up of their median, m: a frame to compare them with the wheels in, not the map's."""
         if not len(self.fix_ns):

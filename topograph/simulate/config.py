@@ -132,6 +132,7 @@ class DriveConfig:
         run: 1 rows downhill and back, 2 the same the other way, 3 zigzag around the trees (thesis 5.3).
         speed: m/s.
         stop_every: stop-and-go distance, m (0: never); `stop_s` the pause.
+        scans_at_stops: clouds are taken while the robot stands, two a second, as in the thesis (5.3).
         laps: how often the run is driven.
         longest_s: the drive is cut there.
     """
@@ -140,6 +141,7 @@ class DriveConfig:
     speed: float = 0.9
     stop_every: float = 0.0
     stop_s: float = 2.0
+    scans_at_stops: bool = False
     laps: int = 1
     longest_s: float = 3600.0
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from topograph.bags.writer import BagWriter
@@ -61,9 +62,9 @@ def record(
         bag.tf_static(start, {("base_link", name): T for name, T in mounts.items()})
         streams = [_small(bag, way, sensor, datum, rng)]
         if sensor.detections:
-            streams.append(_trunks(bag, scene, way, sensor, noise or DetectionNoise(), rng))
+            streams.append(_trunks(bag, scene, way, sensor, noise or DetectionNoise(), rng, run))
         else:
-            streams.append(_clouds(bag, scene, way, sensor, seed, seen, scan_stamps))
+            streams.append(_clouds(bag, scene, way, sensor, seed, seen, scan_stamps, run))
         span = float(way.stamps_ns[-1] - start)
         for log_ns, write in heapq.merge(*streams, key=lambda e: e[0]):
             write()
@@ -119,9 +120,12 @@ def _clouds(
     seed: int,
     seen: list[Any],
     stamps: list[int],
+    run: DriveConfig,
 ) -> Iterator[Event]:
     span = int(1e9 / sensor.sweep_hz)
-    for k, start in enumerate(range(int(way.stamps_ns[0]), int(way.stamps_ns[-1]) - span, span)):
+    starts = np.arange(int(way.stamps_ns[0]), int(way.stamps_ns[-1]) - span, span, dtype=np.int64)
+    for k in np.flatnonzero(_taken(way, starts, span, run)).tolist():
+        start = int(starts[k])
         end = start + span  # velodyne_driver stamps the last packet: times are negative
 
         def write(k: int = k, start: int = start, end: int = end) -> None:
@@ -140,6 +144,21 @@ def _clouds(
         yield end + 5_000_000, write
 
 
+STANDS = 0.002
+"""A robot that moves less during a sweep stands, m."""
+AT_STOPS_NS = 500_000_000
+"""Time between two sweeps at a stop."""
+
+
+def _taken(way: Drive, starts: Stamps, span: int, run: DriveConfig) -> NDArray[np.bool_]:
+    """(S,) sweeps from `starts` on that are recorded."""
+    if not run.scans_at_stops:
+        return np.ones(len(starts), bool)
+    moved = np.interp(starts + span, way.stamps_ns, way.distance) - np.interp(starts, way.stamps_ns, way.distance)
+    every = np.arange(len(starts)) % max(AT_STOPS_NS // span, 1) == 0
+    return np.asarray((moved < STANDS) & every)
+
+
 def _view(s: Sweep, span_s: float) -> Any:
     view = np.zeros(len(s.xyz), _POINT)
     for k, a in enumerate("xyz"):
@@ -155,9 +174,11 @@ def _trunks(
     sensor: SensorConfig,
     noise: DetectionNoise,
     rng: np.random.Generator,
+    run: DriveConfig,
 ) -> Iterator[Event]:
     span = int(1e9 / sensor.sweep_hz)
     stamps = np.arange(int(way.stamps_ns[0]), int(way.stamps_ns[-1]), span, dtype=np.int64)
+    stamps = stamps[_taken(way, stamps, span, run)]
     poses: Array = way.at(stamps)
     for T, s in zip(poses, stamps.tolist(), strict=True):
 

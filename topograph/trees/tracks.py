@@ -32,6 +32,7 @@ class TreesConfig:
         min_sightings, min_ratio: of a tree that exists; ratio of sightings to scans that should show it (recorded detections);
         passed: scans that saw through its place, for each that saw it, that a tree survives;
         usual_score: share of the run's median score of trees that is enough (less existence.DOUBTFUL);
+        reassociate: association and solve go on until neither changes; else trees are as they were first joined (an ablation).
         min_share: of the sightings that trees of the same run have at the median.
     """
 
@@ -49,6 +50,7 @@ class TreesConfig:
     passed: NonNegative = 0.1
     usual_score: NonNegative = 0.27
     min_share: Share = 0.03
+    reassociate: bool = True
 
 
 class Tracker:

@@ -1,0 +1,406 @@
+"""Both methods on the same runs: three questions, each with its own inputs.
+
+A: the same detections, another estimator. B: the same map and trunks, another localizer. C: whole chain against whole chain. Between them
+stand all eight combinations of front end, map and localizer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from topograph.config import Config, over
+from topograph.errors import TopographError
+from topograph.estimate.average import Rule
+from topograph.estimate.ekf import filtered_path
+from topograph.evaluate import Metric, Truth, WorldInMap, map_metrics, path_metrics, trunk_metrics, world_in_map
+from topograph.evaluate.chapter5 import (
+    NodeErrors,
+    Start,
+    error_metrics,
+    node_errors,
+    node_metrics,
+    start_metrics,
+    start_of,
+)
+from topograph.evaluate.localization import LocalizationErrors, localization_errors, localization_metrics
+from topograph.localize import GraphMethod, Method, ThesisMethod
+from topograph.mapping import Progress, prepare, silent
+from topograph.pipeline.localizing import MethodOf, Replay, localize_heard
+from topograph.pipeline.mapping import averaged, mapping_config, solve_run, thesis_map, topo_map
+from topograph.pipeline.read import Heard, hear
+from topograph.topomap import TopoMap
+
+OURS, WRITTEN, BEST = "graph", "thesis as written", "thesis at its best"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A line of a table: which table, what of which run, and its figures."""
+
+    table: str
+    name: str
+    run: str
+    metrics: list[Metric]
+
+
+@dataclass(frozen=True, slots=True)
+class Localized:
+    """A run localized by one chain, and its errors where a truth is given."""
+
+    replay: Replay
+    errors: LocalizationErrors | None
+
+
+@dataclass(slots=True)
+class Compared:
+    """All that the tables and figures are drawn from.
+
+    Attributes:
+        runs: names of the runs; the first one is mapped.
+        rows: of all tables.
+        maps: name of a method -> its map; `nodes` its errors.
+        tracks: (method, run) -> how the whole chain localized it.
+        starts: method -> starts in the first run.
+        truths: of the runs, or None.
+        notes: what had to be left out, and why.
+    """
+
+    runs: list[str] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
+    maps: dict[str, TopoMap] = field(default_factory=dict)
+    nodes: dict[str, NodeErrors] = field(default_factory=dict)
+    worlds: dict[str, WorldInMap] = field(default_factory=dict)
+    tracks: dict[tuple[str, str], Localized] = field(default_factory=dict)
+    starts: dict[str, list[Start]] = field(default_factory=dict)
+    truths: list[Truth | None] = field(default_factory=list)
+    heard: dict[tuple[str, str], Heard] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """A front end's trunks, a map, and a localizer."""
+
+    front_end: str
+    map: str
+    localizer: str
+
+
+def compare_runs(
+    runs: Sequence[Path],
+    truths: Sequence[Truth | None],
+    config: Config,
+    *,
+    starts: int = 16,
+    ablations: bool = False,
+    by_fixes: bool = False,
+    rivals: dict[str, MethodOf] | None = None,
+    progress: Progress = silent,
+) -> Compared:
+    """Map the first run and localize all of them, by both methods. `by_fixes`: each run's own GNSS, filtered, is its truth (thesis 5.3)."""
+    out = Compared(runs=[p.stem for p in runs], truths=list(truths))
+    configs = {OURS: config, WRITTEN: over(config, "thesis"), BEST: over(config, "thesis_best")}
+    for n, path in enumerate(runs):
+        for front_end in ("organised", "thesis"):
+            progress("read", (2 * n + (front_end == "thesis")) / (2 * len(runs)))
+            if front_end == "thesis" and "points" not in out.heard["organised", out.runs[n]].session.chosen:
+                out.heard["thesis", out.runs[n]] = out.heard["organised", out.runs[n]]
+                continue
+            chosen = replace(config, trunks=replace(config.trunks, front_end=front_end))
+            out.heard[front_end, out.runs[n]] = hear([path], chosen)
+    progress("read", 1.0)
+    if all("points" not in out.heard["organised", r].session.chosen for r in out.runs):
+        out.notes.append(
+            "recorded trunk detections, no point clouds: both methods have the same front end, and ICP has no clouds"
+        )
+    if by_fixes:
+        out.truths = [fixes_truth(out.heard["organised", r], config) for r in out.runs]
+        out.notes.append(
+            "truth: each run's own GNSS through the filter (thesis 5.3); it cannot be better than its fixes, and maps used them too"
+        )
+    _detections(out)
+    _maps(out, configs, progress)
+    _localizers(out, configs, rivals or {}, progress)
+    _starts(out, configs, starts, progress)
+    if ablations:
+        _ablations(out, config, progress)
+    return out
+
+
+def fixes_truth(heard: Heard, config: Config) -> Truth | None:
+    """The path of a run by its own GNSS, IMU and wheels through the filter, as the thesis had it; None without GNSS."""
+    p = prepare(heard.session, mapping_config(config)).problem
+    if p.datum is None:
+        return None
+    ns = np.unique(np.concatenate([[t.stamp_ns for t in heard.session.trunks], p.stamps_ns])).astype(np.int64)
+    ns = ns[(ns >= p.stamps_ns[0]) & (ns <= p.stamps_ns[-1])]
+    sigma = float(np.sqrt(np.median(p.fixes.cov[:, 0, 0])))
+    return Truth.of_path(ns, filtered_path(p, ns), p.datum, sigma)
+
+
+# -- detections ---------------------------------------------------------------------------------------------------
+
+
+def _detections(out: Compared) -> None:
+    """Table 5.1 per sweep, with the recall that it never had."""
+    for run, truth in zip(out.runs, out.truths, strict=True):
+        if truth is None or not len(truth.returns):
+            continue
+        for name, front_end in ((OURS, "organised"), ("thesis", "thesis")):
+            trunks = [t.select(t.score >= 0) for t in out.heard[front_end, run].session.trunks]
+            metrics, _ = trunk_metrics(truth, np.array([t.stamp_ns for t in trunks]), [t.p for t in trunks])
+            out.rows.append(Row("5.1 a sweep", name, run, [Metric("trunks", sum(map(len, trunks))), *metrics]))
+
+
+# -- A: the same detections, another estimator ----------------------------------------------------------------------
+
+
+def _maps(out: Compared, configs: dict[str, Config], progress: Progress) -> None:
+    first, truth, config = out.runs[0], out.truths[0], configs[OURS]
+    heard = out.heard["organised", first]
+    progress("map", 0.0)
+    solved = solve_run(heard.session, config)
+    out.maps[OURS] = topo_map(solved, config, {})
+    once = replace(config, trees=replace(config.trees, reassociate=False))
+    flat = solve_run(heard.session, once)
+    paths = {"filter": None, "graph": solved.estimate.map_T_robot}
+    ladder: tuple[tuple[Rule, str], ...] = (
+        ("halving", "eq. 4.14"),
+        ("mean", "mean"),
+        ("inverse", "inverse-variance mean"),
+    )
+    for rule, word in ladder:
+        for path, poses in paths.items():
+            c = replace(config, average=replace(config.average, rule=rule))
+            e, topo = averaged(solved.problem, heard.session, c, {}, path=poses, clouds=False)
+            _add_map(out, "A", f"{word}, {path}'s path", topo, truth, (e.stamps_ns, e.map_T_robot))
+    for name, s in (("graph without re-association", flat), ("graph", solved)):
+        topo = topo_map(s, config, {}, clouds=False)
+        _add_map(out, "A", name, topo, truth, (s.estimate.stamps_ns, s.estimate.map_T_robot))
+    progress("map", 0.5)
+    other = out.heard["thesis", first]
+    made: dict[str, Callable[[], tuple[TopoMap, Any]]] = {
+        "graph on the thesis's trunks": lambda: _graph_map(other, config),
+        WRITTEN: lambda: _thesis_map(other, configs[WRITTEN]),
+        BEST: lambda: _thesis_map(other, configs[BEST]),
+        "thesis's map of our trunks": lambda: _thesis_map(heard, configs[BEST]),
+    }
+    for name, make in made.items():
+        try:
+            out.maps[name], path = make()
+        except TopographError as err:
+            out.notes.append(f"{name}: no map ({err})")
+            continue
+        if name in (WRITTEN, BEST):
+            _add_map(out, "C map", name, out.maps[name], truth, path)
+    _add_map(out, "C map", OURS, out.maps[OURS], truth, (solved.estimate.stamps_ns, solved.estimate.map_T_robot))
+    for name, topo in out.maps.items():
+        if truth is not None:
+            out.worlds[name] = world_in_map(topo, truth)
+            if len(truth.trees):
+                out.nodes[name] = node_errors(topo, truth)
+    progress("map", 1.0)
+
+
+def _graph_map(heard: Heard, config: Config) -> tuple[TopoMap, Any]:
+    s = solve_run(heard.session, config)
+    return topo_map(s, config, {}), (s.estimate.stamps_ns, s.estimate.map_T_robot)
+
+
+def _thesis_map(heard: Heard, config: Config) -> tuple[TopoMap, Any]:
+    _, e, topo = thesis_map(heard.session, config, {})
+    return topo, (e.stamps_ns, e.map_T_robot)
+
+
+def _add_map(out: Compared, table: str, name: str, topo: TopoMap, truth: Truth | None, path: Any) -> None:
+    metrics = [Metric("nodes", len(topo.trees()))]
+    if truth is not None and len(truth.trees):
+        metrics = node_metrics(topo, truth)
+        metrics += [m for m in map_metrics(topo, truth) if "NEES" in m.name]
+    if truth is not None and len(truth.stamps_ns):
+        stamps, poses = path
+        metrics += path_metrics(stamps, poses, topo.datum, truth.stamps_ns, truth.world_T_robot, truth.datum)
+    out.rows.append(Row(table, name, out.runs[0], metrics))
+
+
+# -- B, C and the eight combinations --------------------------------------------------------------------------------
+
+
+def by_graph(topo: TopoMap, config: Config) -> Method:
+    return GraphMethod(topo, config.localize)
+
+
+def by_thesis(topo: TopoMap, config: Config) -> Method:
+    return ThesisMethod(topo, config.thesis)
+
+
+def _localizers(out: Compared, configs: dict[str, Config], rivals: dict[str, MethodOf], progress: Progress) -> None:
+    config = configs[OURS]
+    measured = {m: replace(config, localize=replace(config.localize, measure=m)) for m in ("ranges", "bearings")}
+    methods: list[tuple[str, MethodOf, Config]] = [
+        (OURS, by_graph, config),
+        ("graph, ranges only", by_graph, measured["ranges"]),
+        ("graph, bearings only", by_graph, measured["bearings"]),
+        (WRITTEN, by_thesis, configs[WRITTEN]),
+        (BEST, by_thesis, configs[BEST]),
+        *((name, method, config) for name, method in rivals.items()),
+    ]
+    maps = {
+        "organised": {"graph": OURS, "thesis": "thesis's map of our trunks"},
+        "thesis": {"graph": "graph on the thesis's trunks", "thesis": BEST},
+    }
+    jobs: list[tuple[str, str, str, str, MethodOf, Config]] = []
+    for name, method, c in methods:
+        jobs.append(("B", name, "organised", OURS, method, c))
+    for front_end, by_map in maps.items():
+        for kind, map_name in by_map.items():
+            for word, method, c in (("graph", by_graph, config), ("thesis", by_thesis, configs[BEST])):
+                label = f"{'our' if front_end == 'organised' else 'thesis'} trunks, {kind} map, {word} localizer"
+                jobs.append(("2x2x2", label, front_end, map_name, method, c))
+    jobs.append(("C", OURS, "organised", OURS, by_graph, config))
+    jobs.append(("C", BEST, "thesis", BEST, by_thesis, configs[BEST]))
+    jobs.append(("C", WRITTEN, "thesis", WRITTEN, by_thesis, configs[WRITTEN]))
+    done: dict[tuple[str, str, MethodOf, int, str], Localized] = {}
+    for n, (table, name, front_end, map_name, method, c) in enumerate(jobs):
+        if map_name not in out.maps:
+            continue
+        for k, (run, truth) in enumerate(zip(out.runs, out.truths, strict=True)):
+            progress("localize", (n * len(out.runs) + k) / (len(jobs) * len(out.runs)))
+            key = (front_end, map_name, method, id(c), run)
+            if key not in done:
+                found = _localized(out, front_end, map_name, run, truth, method, c)
+                if found is None:
+                    continue
+                done[key] = found
+            if table == "C":
+                out.tracks[name, run] = done[key]
+            r, e = done[key].replay, done[key].errors
+            metrics = localization_metrics(r.reports, r.distance, r.update_ms, None)
+            metrics += [] if e is None else error_metrics(e)
+            out.rows.append(Row(table, name, run, metrics))
+    progress("localize", 1.0)
+
+
+def _localized(
+    out: Compared, front_end: str, map_name: str, run: str, truth: Truth | None, method: MethodOf, config: Config
+) -> Localized | None:
+    topo = out.maps[map_name]
+    try:
+        replay = localize_heard(topo, out.heard[front_end, run], config, method)
+    except TopographError as err:
+        out.notes.append(f"{run}, {map_name}: not localized ({err})")
+        return None
+    errors = None
+    if truth is not None and len(truth.stamps_ns):
+        errors = localization_errors(replay.reports, truth, _world(out, map_name, truth))
+    return Localized(replay, errors)
+
+
+def _world(out: Compared, map_name: str, truth: Truth) -> WorldInMap:
+    """Georeferenced truths find into a map by themselves; a local one is in the frame of the first run's."""
+    if truth.datum is None and map_name in out.worlds:
+        return out.worlds[map_name]
+    return world_in_map(out.maps[map_name], truth)
+
+
+# -- convergence ------------------------------------------------------------------------------------------------------
+
+
+def _starts(out: Compared, configs: dict[str, Config], n: int, progress: Progress) -> None:
+    """`n` starts along the first run (Figs. 5.14, 5.15), each method in its own chain's map."""
+    run, truth = out.runs[0], out.truths[0]
+    if truth is None or not len(truth.stamps_ns) or n < 1:
+        return
+    chains: list[tuple[str, str, str, MethodOf, Config]] = [
+        (OURS, "organised", OURS, by_graph, configs[OURS]),
+        ("thesis's localizer in our map", "organised", OURS, by_thesis, configs[BEST]),
+        (BEST, "thesis", BEST, by_thesis, configs[BEST]),
+        (WRITTEN, "thesis", WRITTEN, by_thesis, configs[WRITTEN]),
+    ]
+    for c, (name, front_end, map_name, method, config) in enumerate(chains):
+        if map_name not in out.maps:
+            continue
+        heard = out.heard[front_end, run]
+        scans = len(heard.session.trunks)
+        world = _world(out, map_name, truth)
+        found = []
+        for k, scan in enumerate(np.linspace(0, 0.8 * scans, n).astype(int).tolist()):
+            progress("starts", (c * n + k) / (len(chains) * n))
+            r = localize_heard(out.maps[map_name], heard, config, method, first=scan, until_committed=True)
+            found.append(start_of(scan, r.reports, r.distance, r.trunks_seen, truth, world))
+        out.starts[name] = found
+        out.rows.append(Row("convergence", name, run, start_metrics(found)))
+        for trees in sorted({s.trees for s in found}):
+            mine = [s.distance for s in found if s.trees == trees and np.isfinite(s.distance) and not s.wrong]
+            if mine:
+                out.rows.append(
+                    Row(
+                        "5.15",
+                        f"{name}, {trees} trees",
+                        run,
+                        [Metric("convergence mean", float(np.mean(mine)), "m", "lower"), Metric("starts", len(mine))],
+                    )
+                )
+    progress("starts", 1.0)
+
+
+# -- ablations --------------------------------------------------------------------------------------------------------
+
+
+def ablated(config: Config) -> dict[str, Config]:
+    """What is left out -> the configuration without it."""
+    b, e, t = config.bags, config.estimate, config.trees
+    return {
+        "nothing": config,
+        "IMU factors (gyro in dead reckoning stays)": replace(config, estimate=replace(e, use_imu=False)),
+        "IMU": replace(config, bags=replace(b, topic_imu="none")),
+        "dual-antenna heading": replace(config, bags=replace(b, topic_heading="none")),
+        "GNSS": replace(config, bags=replace(b, topic_fix="none", topic_heading="none")),
+        "wheels": replace(config, bags=replace(b, topic_odometry="none")),
+        "robust losses": replace(config, estimate=replace(e, huber=1e6, tukey=1e6)),
+        "learned noise scales": replace(config, estimate=replace(e, learn_scale=False)),
+        "re-association": replace(config, trees=replace(t, reassociate=False)),
+        "existence by free space": replace(config, trees=replace(t, passed=1e6)),
+        "score (all candidates alike)": replace(config, trees=replace(t, usual_score=0.0, min_share=0.0)),
+    }
+
+
+def _ablations(out: Compared, config: Config, progress: Progress) -> None:
+    """Each part left out in turn, on the first run's detections."""
+    first, truth = out.runs[0], out.truths[0]
+    heard = out.heard["organised", first]
+    cases = ablated(config)
+    for k, (name, c) in enumerate(cases.items()):
+        progress("ablations", k / len(cases))
+        session = without(heard, c).session
+        try:
+            s = solve_run(session, c)
+        except TopographError as err:
+            out.rows.append(Row("ablations", f"without {name}", first, []))
+            out.notes.append(f"without {name}: {err}")
+            continue
+        topo = topo_map(s, c, {}, clouds=False)
+        _add_map(out, "ablations", f"without {name}", topo, truth, (s.estimate.stamps_ns, s.estimate.map_T_robot))
+    progress("ablations", 1.0)
+
+
+def without(heard: Heard, config: Config) -> Heard:
+    """The run as if the streams that the configuration turns off had not been recorded; its trunks are those that were detected."""
+    s = heard.session
+    streams, chosen = s.streams, dict(s.chosen)
+    for kind in ("imu", "heading", "fix", "odometry"):
+        if getattr(config.bags, f"topic_{kind}") == "none":
+            streams = streams.without(kind)
+            chosen.pop(kind, None)
+    mounts = {k: v for k, v in s.mounts.items() if k in chosen}
+    return replace(
+        heard, session=replace(s, streams=streams, chosen=chosen, mounts=mounts, notes=[], skipped=s.skipped.copy())
+    )
+
+
+__all__ = ["BEST", "OURS", "WRITTEN", "Compared", "Localized", "Row", "compare_runs"]

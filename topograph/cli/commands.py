@@ -237,57 +237,6 @@ def save_results(
 
 @main.command()
 @click.argument("bags", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--truth", multiple=True, type=click.Path(path_type=Path), help=TRUTH)
-@click.option("--results", type=click.Path(path_type=Path), help="Folder for the figure and report.json.")
-@click.option("-q", "--quiet", is_flag=True, help="No progress.")
-@input_options
-def compare(
-    bags: tuple[Path, ...],
-    truth: tuple[Path, ...],
-    results: Path | None,
-    quiet: bool,
-    config_file: Path | None,
-    **words: Any,
-) -> None:
-    """Map BAGS by factor graph and by the thesis's averaging, side by side on the same detections."""
-    from topograph import pipeline, report
-    from topograph.evaluate import truth_metrics
-    from topograph.evaluate.metrics import doubles, tree_errors
-    from topograph.report.page import show
-
-    config = config_of(config_file, words)
-    true = truth_of(truth)
-    with results_folder(results) as folder, hashed(bags) as inputs:
-        with progress_bar(quiet) as progress:
-            run = pipeline.read_run(bags, config, progress)
-            solved = pipeline.solve_run(run, config, progress=progress)
-            ours = pipeline.topo_map(solved, config, {})
-            estimate, theirs = pipeline.baseline(solved, config)
-        rows: dict[str, list[Any]] = {}
-        errors = {}
-        for name, topo, e in (("graph", ours, solved.estimate), ("thesis", theirs, estimate)):
-            metrics = [doubles(topo)]
-            if true is not None:
-                metrics = truth_metrics(topo, e.stamps_ns, e.map_T_robot, true)
-                errors[name] = np.linalg.norm(tree_errors(topo, true)[2][:, :2], axis=1)
-            rows[name] = [*metrics, replace(metrics[0], name="seconds", value=e.seconds, unit="s")]
-        click.echo(f"{'':<34} {'graph':>12} {'thesis':>12}")
-        theirs_by_name = {m.name: m for m in rows["thesis"]}
-        for m in rows["graph"]:
-            other = theirs_by_name.get(m.name)
-            click.echo(f"{m.name:<34} {show(m):>12} {show(other) if other else '–':>12}")
-        if errors:
-            (folder / "comparison.png").write_bytes(report.comparison_figure(errors))
-        flat = [replace(m, name=f"{k}: {m.name}") for k, ms in rows.items() for m in ms]
-        report.write_json(
-            folder / "report.json", flat, run.skipped, inputs(),
-            solved.seconds, peak_mb(), notes=run.notes, versions=versions(),
-        )  # fmt: skip
-    click.echo(f"written: {folder}")
-
-
-@main.command()
-@click.argument("bags", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--csv", "csv_file", type=click.Path(path_type=Path), help="One row per trunk and scan.")
 @click.option("--picture", type=click.Path(path_type=Path), help="PNG of a scan with its trunks.")
 @click.option(

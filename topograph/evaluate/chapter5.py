@@ -72,6 +72,26 @@ def node_metrics(topo: TopoMap, truth: Truth) -> list[Metric]:
 
 
 @dataclass(frozen=True, slots=True)
+class Sight:
+    """One scan from above, as Fig. 5.6 shows it: trees (T, 2) in `base_link`, and by method trunks (N, 3) and which are right (N,)."""
+
+    trees: Array
+    trunks: dict[str, tuple[Array, NDArray[np.bool_]]]
+
+
+def sight(truth: Truth, stamp_ns: int, trunks: dict[str, Array], gate: float = 0.5) -> Sight:
+    """The scan at `stamp_ns` with the trunks (N, 3) of each method; one is right within `gate` m of a tree that no nearer one has."""
+    T = inverse(interpolate(truth.stamps_ns, truth.world_T_robot, [stamp_ns])[0])
+    trees = transform(T, truth.trees + truth.axes * HEIGHT)[:, :2]
+    out = {}
+    for name, p in trunks.items():
+        right = np.zeros(len(p), bool)
+        right[match(p[:, :2], trees, gate)[0]] = True
+        out[name] = (p, right)
+    return Sight(trees, out)
+
+
+@dataclass(frozen=True, slots=True)
 class Start:
     """One start somewhere in a run (thesis 5.4.3, Fig. 5.14).
 

@@ -311,6 +311,8 @@ class Engine:
         reach: Array, hidden: NDArray[np.bool_],
     ) -> None:  # fmt: skip
         """Two cumulative sums (Page 1954): lost against tracked, and moved by a lattice vector against tracked."""
+        if not len(z):  # a sensor in the leaves, or dark: sooner than that all trees were gone at once
+            return
         c, index = self.config, self.index
         table = self.visibility.table()
         passing = self.visibility.clutter(c.view)

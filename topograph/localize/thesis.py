@@ -133,20 +133,21 @@ class ThesisMethod:
         return Measured(poses, found)
 
     def _report(self, stamp_ns: int, leg: Leg) -> Report:
-        n = len(self.poses)
+        places = self.poses[_distinct(self.poses, TOGETHER)]
+        n = len(places)
         fix = None
         trees = np.zeros(0, np.int64)
         if n == 1:
-            x, y, yaw = self.poses[0]
+            x, y, yaw = places[0]
             near = np.argmin(np.hypot(*(self.topo.p[:, :2] - [x, y]).T))
             T = from_xyz_rpy(x, y, self.topo.p[near, 2], leg.roll, leg.pitch, yaw)
             fix = Fix(stamp_ns, T, np.full((6, 6), np.nan), np.nan)
-            trees = self.topo.ids[list(self.by[0])]
+            trees = self.topo.ids[sorted({t for nodes in self.by for t in nodes})]
         state = "tracking" if n == 1 else "ambiguous" if n else "lost" if self.started else "searching"
         if not n:
             self.started = False
         pairs = np.zeros((0, 2), np.int64)
-        return Report(stamp_ns, state, fix, n, np.nan, self.poses[:200], trees, pairs, np.nan, np.nan)
+        return Report(stamp_ns, state, fix, n, np.nan, places[:200], trees, pairs, np.nan, np.nan)
 
     def _by_distance(self, z: Array) -> list[NDArray[np.int64]]:
         """Algorithm 4: candidate nodes of each trunk."""
@@ -239,11 +240,22 @@ class ThesisMethod:
         """Poses that have become one are one."""
         if self.config.merge <= 0:
             return
-        keep: list[int] = []
-        for k in np.argsort(self.counts, kind="stable").tolist():
-            if all(np.hypot(*(self.poses[k, :2] - self.poses[q, :2])) > self.config.merge for q in keep):
-                keep.append(k)
+        order = np.argsort(self.counts, kind="stable")
+        keep = order[_distinct(self.poses[order], self.config.merge)].tolist()
         self.poses, self.counts, self.by = self.poses[keep], self.counts[keep], [self.by[k] for k in keep]
+
+
+TOGETHER = 0.3
+"""Poses nearer than this to each other are one place: the hypotheses have converged, whether or not they are counted as one, m."""
+
+
+def _distinct(poses: Array, apart: float) -> NDArray[np.int64]:
+    """Rows of `poses` (N, 3), each further than `apart` m from all that were taken before it."""
+    keep: list[int] = []
+    for k in range(len(poses)):
+        if not keep or float(np.hypot(*(poses[keep, :2] - poses[k, :2]).T).min()) > apart:
+            keep.append(k)
+    return np.array(keep, np.int64)
 
 
 FULL_CLOUD = 12

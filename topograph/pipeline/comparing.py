@@ -19,15 +19,16 @@ from topograph.estimate.average import Rule
 from topograph.estimate.ekf import filtered_path
 from topograph.evaluate import Metric, Truth, WorldInMap, map_metrics, path_metrics, trunk_metrics, world_in_map
 from topograph.evaluate.chapter5 import (
-    NodeErrors,
-    Start,
     error_metrics,
     node_errors,
     node_metrics,
+    sight,
     start_metrics,
     start_of,
 )
-from topograph.evaluate.localization import LocalizationErrors, localization_errors, localization_metrics
+from topograph.evaluate.comparison import BEST, OURS, WRITTEN, Comparison, Row, Track
+from topograph.evaluate.localization import localization_errors, localization_metrics
+from topograph.geometry import interpolate
 from topograph.localize import GraphMethod, Method, ThesisMethod
 from topograph.mapping import Progress, prepare, silent
 from topograph.pipeline.localizing import MethodOf, Replay, localize_heard
@@ -35,60 +36,19 @@ from topograph.pipeline.mapping import averaged, mapping_config, solve_run, thes
 from topograph.pipeline.read import Heard, hear
 from topograph.topomap import TopoMap
 
-OURS, WRITTEN, BEST = "graph", "thesis as written", "thesis at its best"
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """A line of a table: which table, what of which run, and its figures."""
-
-    table: str
-    name: str
-    run: str
-    metrics: list[Metric]
-
-
-@dataclass(frozen=True, slots=True)
-class Localized:
-    """A run localized by one chain, and its errors where a truth is given."""
-
-    replay: Replay
-    errors: LocalizationErrors | None
-
 
 @dataclass(slots=True)
-class Compared:
-    """All that the tables and figures are drawn from.
+class _Work:
+    """What is compared, and what it is made of: truths of the runs, what each front end made of them, truth to map, full chains."""
 
-    Attributes:
-        runs: names of the runs; the first one is mapped.
-        rows: of all tables.
-        maps: name of a method -> its map; `nodes` its errors.
-        tracks: (method, run) -> how the whole chain localized it.
-        starts: method -> starts in the first run.
-        truths: of the runs, or None.
-        notes: what had to be left out, and why.
-    """
-
-    runs: list[str] = field(default_factory=list)
-    rows: list[Row] = field(default_factory=list)
-    maps: dict[str, TopoMap] = field(default_factory=dict)
-    nodes: dict[str, NodeErrors] = field(default_factory=dict)
-    worlds: dict[str, WorldInMap] = field(default_factory=dict)
-    tracks: dict[tuple[str, str], Localized] = field(default_factory=dict)
-    starts: dict[str, list[Start]] = field(default_factory=dict)
-    truths: list[Truth | None] = field(default_factory=list)
+    out: Comparison
+    truths: list[Truth | None]
     heard: dict[tuple[str, str], Heard] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
+    worlds: dict[str, WorldInMap] = field(default_factory=dict)
 
-
-@dataclass(frozen=True, slots=True)
-class Chain:
-    """A front end's trunks, a map, and a localizer."""
-
-    front_end: str
-    map: str
-    localizer: str
+    @property
+    def first(self) -> str:
+        return self.out.runs[0]
 
 
 def compare_runs(
@@ -101,35 +61,43 @@ def compare_runs(
     by_fixes: bool = False,
     rivals: dict[str, MethodOf] | None = None,
     progress: Progress = silent,
-) -> Compared:
+) -> Comparison:
     """Map the first run and localize all of them, by both methods. `by_fixes`: each run's own GNSS, filtered, is its truth (thesis 5.3)."""
-    out = Compared(runs=[p.stem for p in runs], truths=list(truths))
+    out = Comparison(runs=_names(runs))
+    w = _Work(out, list(truths))
     configs = {OURS: config, WRITTEN: over(config, "thesis"), BEST: over(config, "thesis_best")}
     for n, path in enumerate(runs):
         for front_end in ("organised", "thesis"):
             progress("read", (2 * n + (front_end == "thesis")) / (2 * len(runs)))
-            if front_end == "thesis" and "points" not in out.heard["organised", out.runs[n]].session.chosen:
-                out.heard["thesis", out.runs[n]] = out.heard["organised", out.runs[n]]
+            if front_end == "thesis" and "points" not in w.heard["organised", out.runs[n]].session.chosen:
+                w.heard["thesis", out.runs[n]] = w.heard["organised", out.runs[n]]
                 continue
             chosen = replace(config, trunks=replace(config.trunks, front_end=front_end))
-            out.heard[front_end, out.runs[n]] = hear([path], chosen)
+            w.heard[front_end, out.runs[n]] = hear([path], chosen)
     progress("read", 1.0)
-    if all("points" not in out.heard["organised", r].session.chosen for r in out.runs):
+    if all("points" not in w.heard["organised", r].session.chosen for r in out.runs):
         out.notes.append(
             "recorded trunk detections, no point clouds: both methods have the same front end, and ICP has no clouds"
         )
     if by_fixes:
-        out.truths = [fixes_truth(out.heard["organised", r], config) for r in out.runs]
+        w.truths = [fixes_truth(w.heard["organised", r], config) for r in out.runs]
         out.notes.append(
             "truth: each run's own GNSS through the filter (thesis 5.3); it cannot be better than its fixes, and maps used them too"
         )
-    _detections(out)
-    _maps(out, configs, progress)
-    _localizers(out, configs, rivals or {}, progress)
-    _starts(out, configs, starts, progress)
+    _detections(w)
+    _maps(w, configs, progress)
+    _per_run(w, configs)
+    _localizers(w, configs, rivals or {}, progress)
+    _starts(w, configs, starts, progress)
     if ablations:
-        _ablations(out, config, progress)
+        _ablations(w, config, progress)
     return out
+
+
+def _names(runs: Sequence[Path]) -> list[str]:
+    """What the runs are called: their stems, numbered where two are alike."""
+    stems = [p.stem for p in runs]
+    return [f"{s} ({n + 1})" if stems.count(s) > 1 else s for n, s in enumerate(stems)]
 
 
 def fixes_truth(heard: Heard, config: Config) -> Truth | None:
@@ -146,23 +114,28 @@ def fixes_truth(heard: Heard, config: Config) -> Truth | None:
 # -- detections ---------------------------------------------------------------------------------------------------
 
 
-def _detections(out: Compared) -> None:
-    """Table 5.1 per sweep, with the recall that it never had."""
-    for run, truth in zip(out.runs, out.truths, strict=True):
+def _detections(w: _Work) -> None:
+    """Table 5.1 per sweep, with the recall that it never had, and a scan to look at."""
+    out = w.out
+    for run, truth in zip(out.runs, w.truths, strict=True):
         if truth is None or not len(truth.returns):
             continue
         for name, front_end in ((OURS, "organised"), ("thesis", "thesis")):
-            trunks = [t.select(t.score >= 0) for t in out.heard[front_end, run].session.trunks]
+            trunks = [t.select(t.score >= 0) for t in w.heard[front_end, run].session.trunks]
             metrics, _ = trunk_metrics(truth, np.array([t.stamp_ns for t in trunks]), [t.p for t in trunks])
+            if run == w.first:
+                mine = {} if out.sight is None else {k: p for k, (p, _) in out.sight.trunks.items()}
+                middle = int(np.median(truth.scan_stamps_ns))
+                out.sight = sight(truth, middle, {**mine, name: min(trunks, key=lambda t: abs(t.stamp_ns - middle)).p})
             out.rows.append(Row("5.1 a sweep", name, run, [Metric("trunks", sum(map(len, trunks))), *metrics]))
 
 
 # -- A: the same detections, another estimator ----------------------------------------------------------------------
 
 
-def _maps(out: Compared, configs: dict[str, Config], progress: Progress) -> None:
-    first, truth, config = out.runs[0], out.truths[0], configs[OURS]
-    heard = out.heard["organised", first]
+def _maps(w: _Work, configs: dict[str, Config], progress: Progress) -> None:
+    out, first, truth, config = w.out, w.first, w.truths[0], configs[OURS]
+    heard = w.heard["organised", first]
     progress("map", 0.0)
     solved = solve_run(heard.session, config)
     out.maps[OURS] = topo_map(solved, config, {})
@@ -178,12 +151,12 @@ def _maps(out: Compared, configs: dict[str, Config], progress: Progress) -> None
         for path, poses in paths.items():
             c = replace(config, average=replace(config.average, rule=rule))
             e, topo = averaged(solved.problem, heard.session, c, {}, path=poses, clouds=False)
-            _add_map(out, "A", f"{word}, {path}'s path", topo, truth, (e.stamps_ns, e.map_T_robot))
+            _add_map(w, "A", f"{word}, {path}'s path", topo, truth, (e.stamps_ns, e.map_T_robot))
     for name, s in (("graph without re-association", flat), ("graph", solved)):
         topo = topo_map(s, config, {}, clouds=False)
-        _add_map(out, "A", name, topo, truth, (s.estimate.stamps_ns, s.estimate.map_T_robot))
+        _add_map(w, "A", name, topo, truth, (s.estimate.stamps_ns, s.estimate.map_T_robot))
     progress("map", 0.5)
-    other = out.heard["thesis", first]
+    other = w.heard["thesis", first]
     made: dict[str, Callable[[], tuple[TopoMap, Any]]] = {
         "graph on the thesis's trunks": lambda: _graph_map(other, config),
         WRITTEN: lambda: _thesis_map(other, configs[WRITTEN]),
@@ -197,14 +170,42 @@ def _maps(out: Compared, configs: dict[str, Config], progress: Progress) -> None
             out.notes.append(f"{name}: no map ({err})")
             continue
         if name in (WRITTEN, BEST):
-            _add_map(out, "C map", name, out.maps[name], truth, path)
-    _add_map(out, "C map", OURS, out.maps[OURS], truth, (solved.estimate.stamps_ns, solved.estimate.map_T_robot))
+            _add_map(w, "C map", name, out.maps[name], truth, path)
+    _add_map(w, "C map", OURS, out.maps[OURS], truth, (solved.estimate.stamps_ns, solved.estimate.map_T_robot))
     for name, topo in out.maps.items():
         if truth is not None:
-            out.worlds[name] = world_in_map(topo, truth)
+            w.worlds[name] = world_in_map(topo, truth)
             if len(truth.trees):
                 out.nodes[name] = node_errors(topo, truth)
+    if truth is not None and len(truth.trees):
+        out.trees = w.worlds[OURS].points(truth.trees)[:, :2]
     progress("map", 1.0)
+
+
+def _per_run(w: _Work, configs: dict[str, Config]) -> None:
+    """Table 5.1 as the thesis counts: each run mapped by itself, each node right or wrong once (eq. 5.1); and its recall."""
+    for run, truth in zip(w.out.runs, w.truths, strict=True):
+        if truth is None or not len(truth.trees):
+            continue
+        for name, front_end in ((OURS, "organised"), (BEST, "thesis"), (WRITTEN, "thesis")):
+            heard, c = w.heard[front_end, run], configs[name]
+            try:
+                if run == w.first:
+                    topo = w.out.maps[name]
+                else:
+                    topo = (_graph_map if name == OURS else _thesis_map)(heard, c)[0]
+            except (TopographError, KeyError) as err:
+                w.out.notes.append(f"{run}, {name}: no map ({err})")
+                continue
+            e = node_errors(topo, truth)
+            right = len(e.node)
+            metrics = [
+                Metric("right", right),
+                Metric("wrong", e.nodes - right, "", "lower"),
+                Metric("accuracy (eq. 5.1)", right / max(e.nodes, 1), "", "higher"),
+                Metric("recall", float(e.seen[e.tree].sum() / max(e.seen.sum(), 1)), "", "higher"),
+            ]
+            w.out.rows.append(Row("5.1 a run", name, run, metrics))
 
 
 def _graph_map(heard: Heard, config: Config) -> tuple[TopoMap, Any]:
@@ -217,7 +218,7 @@ def _thesis_map(heard: Heard, config: Config) -> tuple[TopoMap, Any]:
     return topo, (e.stamps_ns, e.map_T_robot)
 
 
-def _add_map(out: Compared, table: str, name: str, topo: TopoMap, truth: Truth | None, path: Any) -> None:
+def _add_map(w: _Work, table: str, name: str, topo: TopoMap, truth: Truth | None, path: Any) -> None:
     metrics = [Metric("nodes", len(topo.trees()))]
     if truth is not None and len(truth.trees):
         metrics = node_metrics(topo, truth)
@@ -225,7 +226,7 @@ def _add_map(out: Compared, table: str, name: str, topo: TopoMap, truth: Truth |
     if truth is not None and len(truth.stamps_ns):
         stamps, poses = path
         metrics += path_metrics(stamps, poses, topo.datum, truth.stamps_ns, truth.world_T_robot, truth.datum)
-    out.rows.append(Row(table, name, out.runs[0], metrics))
+    w.out.rows.append(Row(table, name, w.first, metrics))
 
 
 # -- B, C and the eight combinations --------------------------------------------------------------------------------
@@ -239,8 +240,8 @@ def by_thesis(topo: TopoMap, config: Config) -> Method:
     return ThesisMethod(topo, config.thesis)
 
 
-def _localizers(out: Compared, configs: dict[str, Config], rivals: dict[str, MethodOf], progress: Progress) -> None:
-    config = configs[OURS]
+def _localizers(w: _Work, configs: dict[str, Config], rivals: dict[str, MethodOf], progress: Progress) -> None:
+    out, config = w.out, configs[OURS]
     measured = {m: replace(config, localize=replace(config.localize, measure=m)) for m in ("ranges", "bearings")}
     methods: list[tuple[str, MethodOf, Config]] = [
         (OURS, by_graph, config),
@@ -265,21 +266,21 @@ def _localizers(out: Compared, configs: dict[str, Config], rivals: dict[str, Met
     jobs.append(("C", OURS, "organised", OURS, by_graph, config))
     jobs.append(("C", BEST, "thesis", BEST, by_thesis, configs[BEST]))
     jobs.append(("C", WRITTEN, "thesis", WRITTEN, by_thesis, configs[WRITTEN]))
-    done: dict[tuple[str, str, MethodOf, int, str], Localized] = {}
+    done: dict[tuple[str, str, MethodOf, int, str], tuple[Replay, Track]] = {}
     for n, (table, name, front_end, map_name, method, c) in enumerate(jobs):
         if map_name not in out.maps:
             continue
-        for k, (run, truth) in enumerate(zip(out.runs, out.truths, strict=True)):
+        for k, (run, truth) in enumerate(zip(out.runs, w.truths, strict=True)):
             progress("localize", (n * len(out.runs) + k) / (len(jobs) * len(out.runs)))
             key = (front_end, map_name, method, id(c), run)
             if key not in done:
-                found = _localized(out, front_end, map_name, run, truth, method, c)
+                found = _localized(w, front_end, map_name, run, truth, method, c)
                 if found is None:
                     continue
                 done[key] = found
             if table == "C":
-                out.tracks[name, run] = done[key]
-            r, e = done[key].replay, done[key].errors
+                out.tracks[name, run] = done[key][1]
+            r, e = done[key][0], done[key][1].errors
             metrics = localization_metrics(r.reports, r.distance, r.update_ms, None)
             metrics += [] if e is None else error_metrics(e)
             out.rows.append(Row(table, name, run, metrics))
@@ -287,33 +288,37 @@ def _localizers(out: Compared, configs: dict[str, Config], rivals: dict[str, Met
 
 
 def _localized(
-    out: Compared, front_end: str, map_name: str, run: str, truth: Truth | None, method: MethodOf, config: Config
-) -> Localized | None:
+    w: _Work, front_end: str, map_name: str, run: str, truth: Truth | None, method: MethodOf, config: Config
+) -> tuple[Replay, Track] | None:
+    out = w.out
     topo = out.maps[map_name]
     try:
-        replay = localize_heard(topo, out.heard[front_end, run], config, method)
+        replay = localize_heard(topo, w.heard[front_end, run], config, method)
     except TopographError as err:
         out.notes.append(f"{run}, {map_name}: not localized ({err})")
         return None
-    errors = None
+    errors = true_xy = None
     if truth is not None and len(truth.stamps_ns):
-        errors = localization_errors(replay.reports, truth, _world(out, map_name, truth))
-    return Localized(replay, errors)
+        world = _world(w, map_name, truth)
+        errors = localization_errors(replay.reports, truth, world)
+        stamps = np.array([r.stamp_ns for r in replay.reports], np.int64)
+        true_xy = world.points(interpolate(truth.stamps_ns, truth.world_T_robot, stamps)[:, :3, 3])[:, :2]
+    return replay, Track(replay.reports, replay.distance, errors, true_xy)
 
 
-def _world(out: Compared, map_name: str, truth: Truth) -> WorldInMap:
+def _world(w: _Work, map_name: str, truth: Truth) -> WorldInMap:
     """Georeferenced truths find into a map by themselves; a local one is in the frame of the first run's."""
-    if truth.datum is None and map_name in out.worlds:
-        return out.worlds[map_name]
-    return world_in_map(out.maps[map_name], truth)
+    if truth.datum is None and map_name in w.worlds:
+        return w.worlds[map_name]
+    return world_in_map(w.out.maps[map_name], truth)
 
 
 # -- convergence ------------------------------------------------------------------------------------------------------
 
 
-def _starts(out: Compared, configs: dict[str, Config], n: int, progress: Progress) -> None:
+def _starts(w: _Work, configs: dict[str, Config], n: int, progress: Progress) -> None:
     """`n` starts along the first run (Figs. 5.14, 5.15), each method in its own chain's map."""
-    run, truth = out.runs[0], out.truths[0]
+    out, run, truth = w.out, w.first, w.truths[0]
     if truth is None or not len(truth.stamps_ns) or n < 1:
         return
     chains: list[tuple[str, str, str, MethodOf, Config]] = [
@@ -325,9 +330,9 @@ def _starts(out: Compared, configs: dict[str, Config], n: int, progress: Progres
     for c, (name, front_end, map_name, method, config) in enumerate(chains):
         if map_name not in out.maps:
             continue
-        heard = out.heard[front_end, run]
+        heard = w.heard[front_end, run]
         scans = len(heard.session.trunks)
-        world = _world(out, map_name, truth)
+        world = _world(w, map_name, truth)
         found = []
         for k, scan in enumerate(np.linspace(0, 0.8 * scans, n).astype(int).tolist()):
             progress("starts", (c * n + k) / (len(chains) * n))
@@ -370,10 +375,10 @@ def ablated(config: Config) -> dict[str, Config]:
     }
 
 
-def _ablations(out: Compared, config: Config, progress: Progress) -> None:
+def _ablations(w: _Work, config: Config, progress: Progress) -> None:
     """Each part left out in turn, on the first run's detections."""
-    first, truth = out.runs[0], out.truths[0]
-    heard = out.heard["organised", first]
+    out, first, truth = w.out, w.first, w.truths[0]
+    heard = w.heard["organised", first]
     cases = ablated(config)
     for k, (name, c) in enumerate(cases.items()):
         progress("ablations", k / len(cases))
@@ -385,7 +390,7 @@ def _ablations(out: Compared, config: Config, progress: Progress) -> None:
             out.notes.append(f"without {name}: {err}")
             continue
         topo = topo_map(s, c, {}, clouds=False)
-        _add_map(out, "ablations", f"without {name}", topo, truth, (s.estimate.stamps_ns, s.estimate.map_T_robot))
+        _add_map(w, "ablations", f"without {name}", topo, truth, (s.estimate.stamps_ns, s.estimate.map_T_robot))
     progress("ablations", 1.0)
 
 
@@ -401,6 +406,3 @@ def without(heard: Heard, config: Config) -> Heard:
     return replace(
         heard, session=replace(s, streams=streams, chosen=chosen, mounts=mounts, notes=[], skipped=s.skipped.copy())
     )
-
-
-__all__ = ["BEST", "OURS", "WRITTEN", "Compared", "Localized", "Row", "compare_runs"]

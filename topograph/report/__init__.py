@@ -1,7 +1,6 @@
 """Tables, figures, HTML, exports. Computes no number that is not already a metric."""
 
 from topograph.report.figures import (
-    comparison_figure,
     map_figure,
     residual_figure,
     scan_figure,
@@ -12,7 +11,6 @@ from topograph.report.page import write_page
 from topograph.report.record import write_json
 
 __all__ = [
-    "comparison_figure",
     "localization_error_figure",
     "localization_figure",
     "map_figure",

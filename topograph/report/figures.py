@@ -116,19 +116,6 @@ def residual_figure(residuals: Mapping[str, Array]) -> bytes:
     return _png(figure)
 
 
-def comparison_figure(errors: Mapping[str, Array]) -> bytes:
-    """Cumulative tree errors (M,) of several methods, m."""
-    figure, ax = _axes(6.5, 4.0)
-    for (name, e), color in zip(errors.items(), (TREE, BAD, PATH, "#762a83"), strict=False):
-        ax.step(np.sort(e), np.arange(1, len(e) + 1) / max(len(e), 1), where="post", label=name, color=color)
-    ax.set_xscale("log")
-    ax.set_xlabel("horizontal error of a tree [m]")
-    ax.set_ylabel("share of trees")
-    ax.grid(alpha=0.3, which="both")
-    ax.legend()
-    return _png(figure)
-
-
 def scan_figure(scan: Scan, base_T_lidar: Array, trunks: Trunks, true: Array | None = None) -> bytes:
     """One sweep from above with its trunks (circles of their diameter, 95 % ellipses), and true trees (N, 2) if given."""
     figure, ax = _axes(10, 9)

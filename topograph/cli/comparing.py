@@ -1,0 +1,147 @@
+"""`topograph compare`."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import click
+
+from topograph import __version__
+from topograph.cli.common import (
+    config_of,
+    hashed,
+    input_options,
+    main,
+    progress_bar,
+    results_folder,
+    say_if_cold,
+    truth_of,
+    versions,
+)
+from topograph.errors import InputError, UsageError
+
+
+@main.command()
+@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--truth", "truths", multiple=True, metavar="TRUTH",
+              help="A simulator's folder, a .tum path, trees as .csv or .geojson, or `fixes` (each run's own GNSS, filtered, as the thesis had "
+                   "it). Once for all runs, or once for each, in order; A+B lays two together.")  # fmt: skip
+@click.option(
+    "--starts", type=click.IntRange(0), default=16, show_default=True, help="Starts along the first run (Fig. 5.14)."
+)
+@click.option("--ablations", is_flag=True, help="Also leave each part out in turn.")
+@click.option("--rival", "rivals", multiple=True, type=click.Path(path_type=Path),
+              help="A Python file with `method(topo, config)`, a localizer with `step(trunks, leg) -> Report`; it joins table B.")  # fmt: skip
+@click.option("--results", type=click.Path(path_type=Path), help="Folder for page, figures and metrics.json.")
+@click.option("-q", "--quiet", is_flag=True, help="No progress.")
+@input_options
+def compare(
+    runs: tuple[Path, ...], truths: tuple[str, ...], starts: int, ablations: bool, rivals: tuple[Path, ...], results: Path | None,
+    quiet: bool, config_file: Path | None, **words: Any,
+) -> None:  # fmt: skip
+    """Both methods on RUNS: map the first, localize all. Chapter 5's tables and figures, three questions, one page.
+
+    A: the same detections, another estimator. B: the same map and trunks, another localizer. C: whole chain against whole chain.
+    """
+    from topograph.config import dump
+    from topograph.pipeline.comparing import compare_runs
+    from topograph.report.comparison import records, write_comparison
+    from topograph.report.record import write_text
+
+    for p in runs:
+        if not p.exists():
+            raise InputError(f"{p}: no such recording")
+    by_fixes = truths == ("fixes",)
+    true = [None] * len(runs) if by_fixes else _truths(truths, len(runs))
+    methods = {p.stem: _method_of(p) for p in rivals}
+    config = config_of(config_file, words)
+    say_if_cold(quiet)
+    began = time.perf_counter()
+    with results_folder(results) as folder, hashed(runs) as hashes:
+        with progress_bar(quiet) as progress:
+            c = compare_runs(
+                list(runs), true, config, starts=starts, ablations=ablations, by_fixes=by_fixes, rivals=methods, progress=progress
+            )  # fmt: skip
+            progress("page", 0.0)
+            facts = {"runs": ", ".join(c.runs), "truth": ", ".join(truths) or "none", "topograph": __version__}
+            pictures = write_comparison(folder / "report.html", c, facts)
+            progress("page", 1.0)
+        for caption, png in pictures.items():
+            (folder / f"{_slug(caption)}.png").write_bytes(png)
+        write_text(folder / "config.yaml", dump(config))
+        record = {"metrics": records(c), "notes": c.notes, "inputs": hashes(), "versions": versions()}
+        write_text(folder / "metrics.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
+    _say(c)
+    click.echo(f"{time.perf_counter() - began:.0f} s; page: {folder / 'report.html'}")
+
+
+def _truths(words: tuple[str, ...], n: int) -> list[Any]:
+    if "fixes" in words:
+        raise UsageError("--truth fixes is for all runs: give it alone")
+    found = [truth_of([Path(p) for p in w.split("+")]) for w in words]
+    if not found:
+        return [None] * n
+    if len(found) == 1:
+        return found * n
+    if len(found) != n:
+        raise UsageError(f"{len(found)} truths for {n} runs: give one for all, or one for each, in order")
+    return found
+
+
+def _method_of(path: Path) -> Any:
+    """`method` of a Python file that the user names."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise UsageError(f"{path}: not a Python file")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    if not hasattr(module, "method"):
+        raise UsageError(f"{path}: has no `method(topo, config)`")
+    return module.method
+
+
+def _slug(caption: str) -> str:
+    return "".join(ch if ch.isalnum() or ch in "." else "_" for ch in caption.split(":")[0].lower()) + (
+        "_" + "".join(ch if ch.isalnum() else "_" for ch in caption.rsplit(" ", 1)[-1]) if ":" in caption else ""
+    )
+
+
+def _say(c: Any) -> None:
+    """The three tables in short."""
+    from topograph.report.comparison import tables
+
+    for t in tables(c):
+        if not t.title.startswith(("A:", "B:", "C:", "Conv")):
+            continue
+        click.echo(f"\n{t.title}")
+        wide = max(len(r.name) for r in t.rows)
+        keep = [k for k, col in enumerate(t.columns) if col in SHORT]
+        click.echo(f"{'':<{wide}}  " + "  ".join(f"{SHORT[t.columns[k]]:>12}" for k in keep))
+        for r in t.rows:
+            click.echo(f"{r.name:<{wide}}  " + "  ".join(f"{r.cells[k].text:>12}" for k in keep))
+    for n in c.notes:
+        click.echo(f"note: {n}", err=True)
+
+
+SHORT = {
+    "nodes": "nodes",
+    "precision (1 m)": "precision",
+    "recall (1 m)": "recall",
+    "tree error at 0.8 m, mean": "error mean",
+    "tree error at 0.8 m, max": "error max",
+    "distance to the first pose": "first pose",
+    "share with a pose after the first": "share posed",
+    "distance error mean": "error mean",
+    "distance error max": "error max",
+    "share of poses wrong": "share wrong",
+    "convergence mean": "mean",
+    "convergence sd": "sd",
+    "convergence max": "max",
+    "starts that ended wrong": "wrong",
+    "starts without an end": "no end",
+}
+"""Columns that a terminal has room for."""

@@ -88,10 +88,23 @@ def test_map_of_a_run(tmp_path: Path, detections_run: tuple[Path, Truth]) -> Non
 
 def test_compare_prints_both(tmp_path: Path, detections_run: tuple[Path, Truth]) -> None:
     path, _ = detections_run
-    out = call("compare", path, "--truth", f"{path}.truth", "--results", tmp_path, "-q")
+    out = call("compare", path, "--truth", f"{path}.truth", "--starts", 2, "--results", tmp_path, "-q")
     assert out.exit_code == 0, out.output
     assert "thesis" in out.output
-    assert (tmp_path / "comparison.png").stat().st_size > 1000
+    found = {m["key"]: m["value"] for m in json.loads((tmp_path / "metrics.json").read_text())["metrics"]}
+    # The ladder climbs, and the graph stands at its end.
+    rungs = [
+        found[f"A/{r}/tree error at 0.8 m, mean"] for r in ("eq. 4.14, filter's path", "mean, filter's path", "graph")
+    ]
+    assert rungs[0] > 1.5 * rungs[2]
+    assert rungs[1] > rungs[2]
+    assert found["B/graph/share of poses wrong"] == 0
+    page = (tmp_path / "report.html").read_text()
+    assert "2.14" not in page  # the thesis's own figures are not ours
+    assert "http://" not in page
+    assert "https://" not in page
+    for caption in ("Fig. 5.7", "Fig. 5.8", "Fig. 5.9", "Fig. 5.10", "Fig. 5.11", "Fig. 5.14", "Fig. 5.15"):
+        assert caption in page
 
 
 def test_no_trunks_is_said(tmp_path: Path) -> None:

@@ -47,6 +47,11 @@ class _Work:
     worlds: dict[str, WorldInMap] = field(default_factory=dict)
 
     @property
+    def one_front_end(self) -> bool:
+        """The runs hold trunk detections, no clouds: there is nothing that the thesis's front end could see."""
+        return all("points" not in self.heard["organised", r].session.chosen for r in self.out.runs)
+
+    @property
     def first(self) -> str:
         return self.out.runs[0]
 
@@ -75,7 +80,7 @@ def compare_runs(
             chosen = replace(config, trunks=replace(config.trunks, front_end=front_end))
             w.heard[front_end, out.runs[n]] = hear([path], chosen)
     progress("read", 1.0)
-    if all("points" not in w.heard["organised", r].session.chosen for r in out.runs):
+    if w.one_front_end:
         out.notes.append(
             "recorded trunk detections, no point clouds: both methods have the same front end, and ICP has no clouds"
         )
@@ -164,6 +169,8 @@ def _maps(w: _Work, configs: dict[str, Config], progress: Progress) -> None:
         "thesis's map of our trunks": lambda: _thesis_map(heard, configs[BEST]),
     }
     for name, make in made.items():
+        if w.one_front_end and name == "graph on the thesis's trunks":
+            continue
         try:
             out.maps[name], path = make()
         except TopographError as err:
@@ -259,6 +266,8 @@ def _localizers(w: _Work, configs: dict[str, Config], rivals: dict[str, MethodOf
     for name, method, c in methods:
         jobs.append(("B", name, "organised", OURS, method, c))
     for front_end, by_map in maps.items():
+        if front_end == "thesis" and w.one_front_end:
+            continue
         for kind, map_name in by_map.items():
             for word, method, c in (("graph", by_graph, config), ("thesis", by_thesis, configs[BEST])):
                 label = f"{'our' if front_end == 'organised' else 'thesis'} trunks, {kind} map, {word} localizer"

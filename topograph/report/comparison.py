@@ -111,13 +111,24 @@ def _table(key: str, rows: Mapping[str, Mapping[str, Figure]]) -> Table:
         known = [r[m] for r in rows.values() if m in r and np.isfinite(r[m].value)]
         if known and known[0].better and len(known) > 1:
             best[m] = (min if known[0].better == "lower" else max)(f.value for f in known)
-    lines = [Line(name, [_cell(row.get(m), best.get(m)) for m in chosen]) for name, row in rows.items()]
+    counted = {m for m in chosen if all(_is_count(r[m]) for r in rows.values() if m in r)}
+    lines = [Line(name, [_cell(row.get(m), best.get(m), m in counted) for m in chosen]) for name, row in rows.items()]
     return Table(title, about, chosen, lines)
 
 
-def _cell(f: Figure | None, best: float | None) -> Cell:
+def _is_count(f: Figure) -> bool:
+    return not f.unit and (not np.isfinite(f.value) or float(f.value).is_integer()) and not f.metric.startswith(SHARES)
+
+
+SHARES = ("share", "precision", "recall", "accuracy", "trunk")
+"""Figures between 0 and 1, also where all of a column are 1."""
+
+
+def _cell(f: Figure | None, best: float | None, count: bool) -> Cell:
     if f is None:
         return Cell("–")
+    if count:
+        return Cell(f"{f.value:.0f}" if np.isfinite(f.value) else "–", "", best is not None and f.value == best)
     low, high = (show(Metric(f.metric, v, f.unit)) for v in (f.low, f.high))
     interval = f"{low} … {high}" if np.isfinite(f.low) and f.low != f.high else ""
     return Cell(show(Metric(f.metric, f.value, f.unit)), interval, best is not None and f.value == best)

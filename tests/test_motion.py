@@ -407,8 +407,8 @@ def test_the_map_teaches_the_wheels_scale_and_whom_to_believe() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_trunks_watch_wheels_and_gyro(seed: int) -> None:
-    from topograph.localize.slip import SlipWatch
     from topograph.motion import Leg
+    from topograph.trees.slip import SlipWatch
 
     rng = np.random.default_rng(seed)
     trees = rng.uniform(-25, 25, (70, 2))

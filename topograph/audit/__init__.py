@@ -1,6 +1,6 @@
 """Do the streams agree with each other and with the solve? Sound, doubtful because, refused because."""
 
-from topograph.audit.checks import REFUSING, fixes, headings, jumps, lean, offsets, standing, trunks, twice
+from topograph.audit.checks import REFUSING, fixes, headings, jumps, lean, offsets, standing, trunks, twice, unclaimed
 from topograph.audit.verdict import Finding, Verdict
 
 __all__ = [
@@ -15,4 +15,5 @@ __all__ = [
     "standing",
     "trunks",
     "twice",
+    "unclaimed",
 ]

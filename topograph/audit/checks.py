@@ -32,6 +32,9 @@ HEADING = 0.06
 """Median difference of heading and path, rad (clean: 0.003)."""
 MOVING, NOTHING_STANDS = 0.3, 0.7
 """Share of detections that seem to move (clean: 0.03), and from which on there is nothing to map."""
+UNCLAIMED, NOBODYS, SURE_TRUNKS, CLOSE_BY = 0.35, 0.7, 100, 12.0
+"""Share of the trunks that the front end is sure of, nearer than so many m, that belong to no tree of the map (clean: up to 0.06; LiDAR
+turned by 90 or 180 degrees: 0.97 and more, pitched by 20: 0.85), from which on nothing stands, and of how many at least."""
 DOUBLED = 0.12
 """Share of trees with another one nearer than a quarter of the usual distance (clean: 0.02; trees that stand at random: 0.04)."""
 TORN = 0.15
@@ -49,7 +52,7 @@ OUTVOTED = 0.25
 """Share of the fixes that three quarters which agree with wheels, trunks and each other outvote."""
 JUMP_WIDE = 0.3
 """Of the step: how far the fixes of one side may lie apart."""
-REFUSING = ("moving",)
+REFUSING = ("moving", "trunks of no tree")
 """Findings that refuse a map."""
 ALIKE_S = 6.0
 """Errors of fixes last for so long."""
@@ -272,6 +275,25 @@ def trunks(problem: Problem, estimate: Estimate, moving: float, is_tree: NDArray
         yield Finding(
             name="doubled", value=doubled, bound=DOUBLED, unit="",
             sentence=f"{100 * doubled:.0f} % of the trees have another one much nearer than is usual here: the map may show them twice",
+        )  # fmt: skip
+
+
+def unclaimed(p: Array, score: Array, used: Array, tree: NDArray[np.int64]) -> Iterator[Finding]:
+    """Do the trunks that were surely seen become trees? Of all (N, 3) with log-odds (N,), those `used` (M, 3) have a tree (M,) or -1.
+
+    Where the sensor is mounted otherwise than TF says, nothing stands still for long enough to be one.
+    """
+    near = (np.hypot(p[:, 0], p[:, 1]) < CLOSE_BY) & (score >= 0)
+    n = int(near.sum())
+    if n < SURE_TRUNKS:
+        return
+    claimed = int(((np.hypot(used[:, 0], used[:, 1]) < CLOSE_BY) & (tree >= 0)).sum())
+    share = 1.0 - claimed / n
+    if share > UNCLAIMED:
+        yield Finding(
+            name="trunks of no tree", value=share, bound=UNCLAIMED, unit="", refuses=share > NOBODYS,
+            sentence=f"{100 * share:.0f} % of the trunks that were surely seen belong to no tree of the map: they do not stand still in it, so the "
+            "LiDAR is mounted otherwise than TF says, its axes or its clock are wrong, or the wheels are",
         )  # fmt: skip
 
 

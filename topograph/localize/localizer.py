@@ -17,10 +17,10 @@ from topograph.localize.config import LocalizeConfig
 from topograph.localize.engine import Belief, Engine
 from topograph.localize.index import build_index
 from topograph.localize.method import Fix, Method, Report
-from topograph.localize.slip import SlipWatch
 from topograph.localize.submap import Move, Sweep
 from topograph.motion import Leg, Reckoner
 from topograph.topomap import TopoMap
+from topograph.trees import SlipWatch
 from topograph.trunks import none_at
 
 if TYPE_CHECKING:  # loading it takes a second, and recorded trunks do without

@@ -18,7 +18,7 @@ from topograph.mapping.known import KnownMap, Placed, put
 from topograph.mapping.progress import Progress, silent
 from topograph.motion import Motion, align_imu, dead_reckon, in_radians, without_nonsense
 from topograph.session import Session, Streams
-from topograph.trees import Detections, Existence, Shapes, choose_keyframes, follow, screen
+from topograph.trees import Detections, Existence, Shapes, choose_keyframes, follow, screen, with_trunks_way
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,10 +139,12 @@ def prepare(
         )
     if not motion.wheels:
         notes.append("no wheel odometry: the motion between poses rests on GNSS fixes, IMU and trunks")
-    notes += _wheel_notes(motion)
     if not motion.gyro:
         notes.append("no IMU: turns rest on the wheels, the slope on GNSS and trunks")
     detections = _covered(Detections.of(run.trunks), motion, notes)
+    if screened:
+        motion = with_trunks_way(motion, detections)
+    notes += _wheel_notes(motion)
     track, moving = np.arange(len(detections)), 0.0
     if screened:
         detections, track, moving = _screened(detections, motion, config, notes)
@@ -192,7 +194,7 @@ def _wheel_notes(motion: Motion) -> list[str]:
     for begin, end, speed in motion.slips[:5].tolist():
         out.append(
             f"wheels slipped or were blocked from {begin:.1f} to {end:.1f} s (off by {-speed:+.2f} m/s): "
-            "the fixes' speed stands in"
+            f"the {'trunks' if motion.slips_by_trunks else 'fixes'}' speed stands in"
         )
     if len(motion.slips) > 5:
         out.append(f"wheels slipped {len(motion.slips) - 5} more times")

@@ -64,6 +64,7 @@ class Motion:
         doubt: (M,) m, what slips add to the deviation of the steps, summed up; () where there were none.
         wheel_scale: what the wheels were multiplied with, since fixes told so.
         slips: (S, 3) from, to (s since the first stamp) and the robot's speed less the wheels', m/s.
+        slips_by_trunks: trunks told of them, not fixes.
         unseen: (M,) rad, what was turned in gaps of the gyro, where the wheels tell it, summed up; () where there were none.
     """
 
@@ -77,6 +78,7 @@ class Motion:
     wheel_scale: float = 1.0
     slips: Array = field(default_factory=lambda: np.zeros((0, 3)))
     unseen: Array = field(default_factory=lambda: np.zeros(0))
+    slips_by_trunks: bool = False
 
     def at(self, stamps_ns: Stamps) -> Array:
         """Poses (K, 4, 4) at any stamps; outside the recording the nearest end holds."""

@@ -21,6 +21,7 @@ def audited(solved: Solved) -> Verdict:
         *(f for f in audit.offsets(p, e) if not p.placed or f.name not in ("fix clock", "antenna")),
         *(() if p.placed else _of_gnss(solved)),
         *audit.trunks(p, e, solved.moving, solved.existence.kind == TREE),
+        *_unclaimed(solved),
         *_mounts(solved),
     ]
     return Verdict(tuple(sorted(found, key=lambda f: (not f.refuses, -f.value / f.bound))))
@@ -33,6 +34,17 @@ def _of_gnss(solved: Solved) -> Iterator[Finding]:
     yield from audit.jumps(p, e, solved.streams, _lever(solved))
     yield from audit.standing(solved.streams, solved.motion)
     yield from audit.headings(p, e)
+
+
+def _unclaimed(solved: Solved) -> Iterator[Finding]:
+    trunks = solved.run.trunks
+    if not trunks:
+        return
+    d = solved.detections
+    sure = d.score >= 0
+    yield from audit.unclaimed(
+        np.concatenate([t.p for t in trunks]), np.concatenate([t.score for t in trunks]), d.p[sure], solved.tree[sure]
+    )
 
 
 TURNED = np.radians(45.0)

@@ -8,7 +8,9 @@ from topograph.trees.refine import refine
 from topograph.trees.screen import screen
 from topograph.trees.shape import Shapes, relevelled, shapes
 from topograph.trees.sightings import AtKeyframes, Sightings, gather
+from topograph.trees.slip import SlipWatch
 from topograph.trees.tracks import Tracker, TreesConfig, follow
+from topograph.trees.wheels import with_trunks_way
 
 __all__ = [
     "AtKeyframes",
@@ -17,6 +19,7 @@ __all__ = [
     "LoopCloser",
     "Shapes",
     "Sightings",
+    "SlipWatch",
     "TrackTable",
     "Tracker",
     "TreesConfig",
@@ -32,4 +35,5 @@ __all__ = [
     "seen_through",
     "shapes",
     "tabulate",
+    "with_trunks_way",
 ]

@@ -61,7 +61,7 @@ class SlipWatch:
         if leg.seconds <= 0 or leg.blind > 0 or last is None:
             self._rows, self.standing = [], 0.0
             return leg
-        found = _residual(last, flat, leg)
+        found = between(last, flat, leg)
         if found is None:
             self._missed += 1
             if self._missed > MISSED:
@@ -96,7 +96,7 @@ class SlipWatch:
         return leg
 
 
-def _residual(last: Array, now: Array, leg: Leg) -> tuple[Array, Array] | None:
+def between(last: Array, now: Array, leg: Leg) -> tuple[Array, Array] | None:
     """By how much (x forward, y to the left, m, yaw, rad) the robot moved more than the leg says, and the deviations of place and
     yaw; None where trunks do not tell."""
     if len(last) < LEAST or len(now) < LEAST:

@@ -1,0 +1,119 @@
+"""Wheels that slip or are blocked, told by the trunks: what GNSS tells where there is any (`motion.wheels`), here without it.
+
+From one scan to the next the same trunks say how the robot moved. Where, over a second, they contradict dead reckoning by far more than
+their noise, the way that they tell stands in, with its deviation. The rule is `SlipWatch`'s, looking back and ahead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from topograph.geometry import Array, inverse, planar, transform, yaw_of
+from topograph.motion import Leg, Motion
+from topograph.trees.detections import Detections
+from topograph.trees.slip import LONGEST_S, OFF, REACH, SHARE, SIGMAS, between
+
+GAP_NS = 500_000_000
+"""Scans further apart do not tell of a slip: trunks might be taken for their neighbours."""
+LEGS = 5
+"""Legs of a window, at least."""
+MOST = 0.3
+"""Share of a run that may slip; beyond it, it is no slip but the mounting, the clock or the scale."""
+PART = 0.25
+"""A leg in a window that slips belongs to the slip when it is off by so much of the window's mean."""
+
+
+def with_trunks_way(motion: Motion, d: Detections) -> Motion:
+    """The motion with the trunks' way where they contradict the wheels; itself where they do not."""
+    if not motion.wheels or len(d) == 0 or len(d.stamps_ns) < 3 * LEGS:
+        return motion
+    ns, legs = _legs(motion, d)
+    if len(legs) < LEGS:
+        return motion
+    slipping = _slipping(ns, legs)
+    driven = np.hypot(legs[:, 2], legs[:, 3])
+    if not slipping.any() or slipping.sum() > MOST * max(int((driven > 0.01).sum()), 1):
+        return motion
+    return _corrected(motion, ns, legs, slipping)
+
+
+def _legs(motion: Motion, d: Detections) -> tuple[NDArray[np.int64], Array]:
+    """From and to (L, 2), ns, and (L, 5): what the trunks add to the leg (x, y, m, in the robot's frame), its way (x, y, m), their sigma."""
+    odom_T_robot = motion.at(d.stamps_ns)
+    up = planar(odom_T_robot[:, 0, 3], odom_T_robot[:, 1, 3], yaw_of(odom_T_robot))
+    up[:, 2, 3] = odom_T_robot[:, 2, 3]
+    flat = transform((inverse(up) @ odom_T_robot)[d.scan], d.p)[:, :2]
+    use = (np.hypot(*flat.T) < REACH) & (d.score >= 0)
+    order = np.argsort(d.scan[use], kind="stable")
+    rows = np.flatnonzero(use)[order]
+    ends = np.searchsorted(d.scan[rows], np.arange(len(d.stamps_ns) + 1))
+    yaw = yaw_of(odom_T_robot)
+    spans, legs = [], []
+    for a, b in pairwise(range(len(d.stamps_ns))):
+        if not 0 < d.stamps_ns[b] - d.stamps_ns[a] < GAP_NS:
+            continue
+        last, now = (flat[rows[ends[k] : ends[k + 1]]] for k in (a, b))
+        way = odom_T_robot[b, :2, 3] - odom_T_robot[a, :2, 3]
+        c, s = np.cos(yaw[a]), np.sin(yaw[a])
+        step = np.array([c * way[0] + s * way[1], -s * way[0] + c * way[1], yaw[b] - yaw[a]])
+        found = between(last, now, Leg(step=step, distance=0.0, turned=0.0, seconds=0.0))
+        if found is not None:
+            spans.append((d.stamps_ns[a], d.stamps_ns[b]))
+            legs.append((*found[0][:2], *step[:2], found[1][0]))
+    return np.array(spans, np.int64).reshape(-1, 2), np.array(legs).reshape(-1, 5)
+
+
+def _slipping(ns: NDArray[np.int64], legs: Array) -> NDArray[np.bool_]:
+    """(L,) legs on which the wheels are contradicted."""
+    out = np.zeros(len(legs), bool)
+    total = np.concatenate([np.zeros((1, 5)), np.cumsum(np.column_stack([legs[:, :4], legs[:, 4] ** 2]), axis=0)])
+    j = np.searchsorted(ns[:, 0], ns[:, 0] + int(LONGEST_S * 1e9))
+    for i in range(len(legs)):
+        k = int(j[i])
+        if k - i < LEGS:
+            continue
+        whole = total[k] - total[i]
+        off, way = float(np.hypot(*whole[:2])), float(np.hypot(*whole[2:4]))
+        # Neighbouring scans share trunks: their noise cancels but at the ends.
+        noise = float(np.sqrt(whole[4] / (k - i)))
+        if off > max(OFF, SHARE * way, SIGMAS * noise * 2.0):
+            along = legs[i:k, :2] @ whole[:2] / off
+            out[i:k] |= along > PART * off / (k - i)
+    return out
+
+
+def _corrected(motion: Motion, ns: NDArray[np.int64], legs: Array, slipping: NDArray[np.bool_]) -> Motion:
+    """The motion with what the trunks add on the legs that slip."""
+    yaw = yaw_of(motion.at(ns[:, 0]))
+    c, s = np.cos(yaw), np.sin(yaw)
+    add = np.column_stack([c * legs[:, 0] - s * legs[:, 1], s * legs[:, 0] + c * legs[:, 1]]) * slipping[:, None]
+    times = ns.ravel()
+    t = motion.stamps_ns
+    moved = motion.odom_T_robot.copy()
+    for axis in range(2):
+        steps = np.column_stack([np.zeros(len(add)), add[:, axis]]).ravel()
+        moved[:, axis, 3] += np.interp(t, times, np.cumsum(steps))
+    doubt = np.interp(t, times, np.cumsum(np.column_stack([np.zeros(len(legs)), legs[:, 4] * slipping]).ravel()))
+    if len(motion.doubt):
+        doubt = doubt + motion.doubt
+    way = np.linalg.norm(np.diff(moved[:, :3, 3], axis=0), axis=1)
+    return replace(
+        motion, odom_T_robot=moved, distance=np.concatenate([[0.0], np.cumsum(way)]), doubt=doubt,
+        slips=np.concatenate([motion.slips, _intervals(motion, ns, legs, slipping)]), slips_by_trunks=True,
+    )  # fmt: skip
+
+
+def _intervals(motion: Motion, ns: NDArray[np.int64], legs: Array, slipping: NDArray[np.bool_]) -> Array:
+    """(S, 3) from, to (s since the first stamp) and the robot's speed less the wheels', m/s."""
+    rows = np.flatnonzero(slipping)
+    parts = np.split(rows, np.flatnonzero(ns[rows[1:], 0] - ns[rows[:-1], 1] > GAP_NS) + 1)
+    out = []
+    for part in parts:
+        begin, end = ns[part[0], 0], ns[part[-1], 1]
+        ahead = float(np.sum(legs[part, 0])) / max((end - begin) * 1e-9, 0.1)
+        out.append(((begin - motion.stamps_ns[0]) * 1e-9, (end - motion.stamps_ns[0]) * 1e-9, ahead))
+    return np.array(out).reshape(-1, 3)

@@ -251,6 +251,7 @@ def test_any_file_name(tmp_path: Path, name: str) -> None:
         "UPDATE edges SET length = length + 1 WHERE id = 1", "UPDATE path SET qz = -qz WHERE id = 1",
         "UPDATE meta SET value = '10,20,30' WHERE key = 'datum'", "DELETE FROM trees WHERE id = 3",
         "UPDATE viewpoints SET vx = -vx, vy = -vy", "UPDATE viewpoints SET tree = 2 WHERE id = 1",
+        "DELETE FROM meta WHERE key LIKE 'digest:%'", "DELETE FROM meta WHERE key = 'digest:trees'",
     ],
 )  # fmt: skip
 def test_what_was_not_written_is_not_read(tmp_path: Path, change: str) -> None:
@@ -259,6 +260,19 @@ def test_what_was_not_written_is_not_read(tmp_path: Path, change: str) -> None:
     assert edit(path, change) > 0
     with pytest.raises(MapError, match="repair"):
         store.load(path)
+
+
+def test_absurd_rows_are_refused_whatever_their_digests(tmp_path: Path) -> None:
+    for change in (
+        "UPDATE meta SET value = '95,500,1e9' WHERE key = 'datum'", "UPDATE meta SET value = 'nan,0,0' WHERE key = 'datum'",
+        "UPDATE trees SET axis_x = NULL WHERE id = 2", "UPDATE trees SET x = 1e308 WHERE id = 1",
+        "INSERT INTO meta VALUES ('zz', zeroblob(100000000))", "UPDATE meta SET value = '-5' WHERE key = 'schema_version'",
+    ):  # fmt: skip
+        path = tmp_path / "m.gpkg"
+        store.save(make(12), path)
+        edit(path, change)
+        with pytest.raises(MapError):
+            store.load(path, check=False)
 
 
 def test_views_and_triggers_are_not_run(tmp_path: Path) -> None:

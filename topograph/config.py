@@ -67,9 +67,11 @@ def load(path: Path | None, overrides: dict[str, Any] | None = None) -> Config:
 def _read(path: Path) -> dict[str, Any]:
     if not path.exists() and str(path) in PRESETS:
         path = preset(str(path))
+    if path.exists() and not path.is_file():
+        raise UsageError(f"{path}: not a file")
     try:
         data = yaml.load(path.read_text(), _Loader) or {}  # noqa: S506  # a subclass of the safe loader
-    except (OSError, yaml.YAMLError) as err:
+    except (OSError, yaml.YAMLError, ValueError, TypeError, RecursionError) as err:
         raise UsageError(f"{path}: cannot be read as YAML ({err})") from err
     if not isinstance(data, dict):
         raise UsageError(f"{path}: a configuration is a mapping of rooms; see `topograph config`")
@@ -102,6 +104,8 @@ def from_dict(data: dict[str, Any]) -> Config:
         if room not in rooms:
             raise UsageError(f"configuration: unknown key {room!r}; known are {', '.join(rooms)}")
         known = getattr(Config(), room).__dataclass_fields__
+        if block is not None and not isinstance(block, dict):
+            raise UsageError(f"configuration: {room} is a block of settings, not {block!r}")
         for key in block or {}:
             if key not in known:
                 raise UsageError(f"configuration: unknown key '{room}.{key}'; known are {', '.join(known)}")

@@ -210,6 +210,7 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
     except sqlite3.Error as err:
         raise MapError(f"{path}: cannot be opened ({err})") from err
     try:
+        c.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST)
         c.execute("PRAGMA trusted_schema=OFF")
         c.execute("PRAGMA cell_size_check=ON")
         foreign = c.execute(  # the spatial indices that QGIS makes are harmless: nothing is written through them here
@@ -220,6 +221,8 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
         row = c.execute("SELECT value FROM meta WHERE key='schema_version'").fetchone()
         if row is None:
             raise MapError(f"{path}: a GeoPackage, but not a topograph map (no schema version)")
+        if not int(row[0]) >= 1:
+            raise MapError(f"{path}: schema {row[0]} is none: the file is damaged; restore a copy")
         if int(row[0]) > SCHEMA_VERSION:
             raise MapError(f"{path}: schema {row[0]} is newer than this program's {SCHEMA_VERSION}: update topograph")
         yield c
@@ -231,6 +234,10 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
         c.close()
 
 
+FARTHEST = 1e6
+"""Of a tree from the datum, and of the datum's height, m."""
+LARGEST = 64 * 1024**2
+"""Bytes of a text, a blob or a row: the cloud of a viewpoint has thousands of points, not millions."""
 _DIGESTED = ("trees", "edges", "path", "viewpoints", "sessions", "sightings", "meta")
 
 
@@ -252,7 +259,15 @@ def _has(c: sqlite3.Connection, table: str, column: str) -> bool:
 
 
 def _check_digests(c: sqlite3.Connection, path: Path) -> None:
-    """Maps of older programs have none."""
+    """Maps of older programs, which knew no sessions, have none."""
+    there = {k.removeprefix("digest:") for (k,) in c.execute("SELECT key FROM meta WHERE key LIKE 'digest:%'")}
+    (version,) = c.execute("SELECT value FROM meta WHERE key='schema_version'").fetchone()
+    with_digests = int(version) >= 2 and _has(c, "sessions", "id")
+    if missing := (set(_DIGESTED) - there if with_digests else set()):
+        raise MapError(
+            f"{path}: the digest of table {min(missing)!r} is gone: the file was edited elsewhere; restore a copy, or take over what it says "
+            f"with `topograph repair {path.name} NEW.gpkg`"
+        )
     for key, value in c.execute("SELECT key, value FROM meta WHERE key LIKE 'digest:%'").fetchall():
         table = key.removeprefix("digest:")
         if table in _DIGESTED and _digest(c, table) != value:
@@ -367,6 +382,14 @@ def load(path: Path | str, *, clouds: bool = True, check: bool = True) -> TopoMa
         p = v[:, 1:4]
         if not (np.isfinite(p).all() and np.isfinite(path_rows).all()):
             raise MapError(f"{path}: a position is not finite: the file is damaged; restore a copy")
+        if np.abs(p).max(initial=0.0) > FARTHEST or not np.isfinite(v[:, 8:11]).all():
+            raise MapError(
+                f"{path}: a tree stands nowhere on Earth, or has no axis: the file is damaged; restore a copy"
+            )
+        if datum is not None and not (abs(datum.lat) <= 90 and abs(datum.lon) <= 360 and abs(datum.h) < FARTHEST):
+            raise MapError(
+                f"{path}: the datum {meta['datum']} is no place on Earth: the file is damaged; restore a copy"
+            )
         return TopoMap(
             datum=datum,
             ids=ids,

@@ -35,6 +35,8 @@ from topograph.geometry import from_quaternion
 log = logging.getLogger(__name__)
 
 UNDECODED = "cannot be decoded"
+INFINITE = "not finite"
+EMPTY = "no point in it"
 DAMAGED = "announced by the recording's index, not in the file (damaged)"
 
 Reader = AnyReader | Salvaged | SalvagedFolder
@@ -336,21 +338,29 @@ class Recording:
                 odometry = decode.unpack_odometry(raw, reader.is2)
                 turn = np.abs(odometry.odom_T_child[3:]).max()
                 if not _sane(odometry.odom_T_child) or not _sane(odometry.twist) or turn < decode.SHORTEST:
-                    self._count("odometry: not finite")
+                    self._count(f"odometry: {INFINITE}")
                     return None
                 return odometry
             message: Any = reader.deserialize(raw, typ)
             if kind == "points":
-                return decode_scan(message, decode.stamp_of(message.header))
+                scan = decode_scan(message, decode.stamp_of(message.header))
+                if not np.isfinite(scan.xyz).all(axis=1).any():
+                    self._count(f"points: {EMPTY}")
+                    return None
+                return scan
             if kind == "fix":
                 return decode.decode_fix(message)
             if kind == "heading":
                 heading = decode.decode_heading(message)
                 if not np.isfinite(heading.yaw):
-                    self._count("heading: not finite")
+                    self._count(f"heading: {INFINITE}")
                     return None
                 return heading
-            return decode.decode_trunks(message)
+            trunks = decode.decode_trunks(message)
+            if not len(trunks) and (getattr(message, "detections", None) or getattr(message, "clusters", None)):
+                self._count(f"trunks: {INFINITE}")
+                return None
+            return trunks
         except Exception as err:  # noqa: BLE001  # one message; it is counted, and read_run bounds how many
             self._count(f"{kind}: {UNDECODED}")
             self.undecoded.setdefault(kind, str(err) or type(err).__name__)
@@ -365,7 +375,7 @@ class Recording:
     def _finite_imu(self, imu: Imu) -> Imu | None:
         if _sane(imu.gyro) and _sane(imu.accel):
             return imu
-        self._count("imu: not finite")
+        self._count(f"imu: {INFINITE}")
         return None
 
 

@@ -16,6 +16,7 @@ from topograph import __version__
 from topograph.cli.common import (
     TRUTH,
     check_accepted,
+    check_output,
     check_target,
     config_of,
     hashed,
@@ -88,12 +89,14 @@ def map_command(
             raise MapError(f"{into}: no such map")
         stack.enter_context(store.locked(target))
         old = None if into is None else store.load(into)
-        inputs = stack.enter_context(hashed(bags))
+        inputs = stack.enter_context(hashed(bags, whole=to_s == float("inf")))
         with progress_bar(quiet) as progress:
             run = pipeline.read_run(bags, config, progress, (from_s, to_s), jobs)
             if method == "thesis":
                 topo = save_thesis(run, config, inputs(), folder, target, true, check_fixes)
                 trees = f"{target}: {len(topo)} trees by the thesis's method, {len(topo.edges)} edges, {len(topo.viewpoints)} viewpoints"
+                for note in run.notes:
+                    click.echo(f"note: {note}", err=True)
                 click.echo(f"{trees}; report: {folder / 'report.json'}")
                 return
             placed = None
@@ -221,7 +224,7 @@ def save_results(
         store.save(topo, target)
     report.write_json(
         folder / "report.json", metrics, solved.run.skipped, inputs, seconds, peak_mb(), notes=notes, versions=versions(),
-        topics=solved.run.chosen, scales=solved.estimate.scales, verdict=verdict.record(),
+        topics=solved.run.chosen, announced=solved.run.announced, scales=solved.estimate.scales, verdict=verdict.record(),
         offsets=[{"name": o.name, "value": o.value.tolist(), "sigma": o.sigma.tolist(), "gain": o.gain} for o in solved.estimate.offsets],
     )  # fmt: skip
     said = [f"{verdict.word}: {r}" for r in verdict.reasons] or [
@@ -269,6 +272,8 @@ def detect(
 
     config = config_of(config_file, words)
     true = truth_of(truth)
+    check_output(csv_file, bags, (".csv",))
+    check_output(picture, bags, (".png",))
     if true is not None and (not len(true.returns) or not len(true.trees)):
         raise UsageError(
             "detect --truth needs a simulator's folder: it says how many returns each sweep had of each trunk"
@@ -278,6 +283,8 @@ def detect(
         progress = stack.enter_context(progress_bar(quiet))
         run = pipeline.read_run(bags, config, progress, jobs=jobs)
         inputs = hashes()
+    for note in run.notes:
+        click.echo(f"note: {note}", err=True)
     if run.scans == 0:
         raise InputError("no point cloud and no trunk detections; name a topic with --topic-points or --topic-trunks")
     # What a single scan doubts is for the map to decide; here it would only be a false trunk.
@@ -345,18 +352,20 @@ def detect(
     show_default=True,
     help="grid, olive, steep, gentle, hedgerow, young, trellis, old_olive, bare, forest or yard.",
 )
-@click.option("--seed", type=int, default=1, show_default=True)
+@click.option("--seed", type=click.IntRange(0), default=1, show_default=True)
 @click.option("--run", "number", type=click.IntRange(1, 3), default=1, show_default=True,
               help="1: rows downhill and back; 2: the other way; 3: zigzag (thesis 5.3).")  # fmt: skip
 @click.option("--gnss", type=click.Choice(["rtk", "float", "degraded", "none"]), default="rtk", show_default=True)
 @click.option("--rings", type=click.Choice(["16", "32", "64", "128"]), default="16", show_default=True)
-@click.option("--sweep-hz", type=float, default=10.0, show_default=True)
-@click.option("--stop-every", type=float, default=0.0, help="Stop and go, as in the thesis: metres between stops.")
+@click.option("--sweep-hz", type=click.FloatRange(0.1, 50.0), default=10.0, show_default=True)
+@click.option(
+    "--stop-every", type=click.FloatRange(0.0), default=0.0, help="Stop and go, as in the thesis: metres between stops."
+)
 @click.option(
     "--scans-at-stops", is_flag=True, help="Clouds only while the robot stands, two a second (with --stop-every)."
 )
-@click.option("--longest", type=float, default=3600.0, help="Cut the drive after so many seconds.")
-@click.option("--laps", type=int, default=1)
+@click.option("--longest", type=click.FloatRange(1.0), default=3600.0, help="Cut the drive after so many seconds.")
+@click.option("--laps", type=click.IntRange(1), default=1)
 @click.option("--compression", type=click.Choice(["none", "lz4", "zstd"]), default="none")
 @click.option("--detections", is_flag=True, help="Write trunk detections in place of clouds (fast).")
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
@@ -471,6 +480,7 @@ def view(map_file: Path, output: Path) -> None:
     from topograph import report, store
     from topograph.evaluate.metrics import Metric, doubles
 
+    check_output(output, [map_file], (".html",))
     topo = store.load(map_file, clouds=False)
     metrics = [Metric("trees", int(topo.is_tree.sum())), Metric("edges", len(topo.edges)), doubles(topo)]
     notes = [] if topo.datum is not None else ["not georeferenced: the frame is the first pose of the run"]

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ctypes
+import errno
 import hashlib
 import logging
+import math
 import os
 import platform
 import resource
+import signal
 import sys
 import threading
 import time
@@ -29,6 +32,14 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 _TOPICS = ("points", "trunks", "odometry", "imu", "fix", "heading")
 
 
+class Terminated(BaseException):
+    """SIGTERM."""
+
+
+def _end(*_: Any) -> None:
+    raise Terminated
+
+
 class _Group(click.Group):
     """Turns errors into one line on stderr and their exit code."""
 
@@ -42,6 +53,12 @@ class _Group(click.Group):
             raise
         except BrokenPipeError:
             os._exit(0)
+        except KeyboardInterrupt:
+            click.echo("topograph: stopped by hand; nothing half done was left", err=True)
+            ctx.exit(130)
+        except Terminated:
+            click.echo("topograph: told to end; nothing half done was left", err=True)
+            ctx.exit(143)
         except MemoryError:
             click.echo(
                 "topograph: not enough memory for this recording; map a part of it with --from and --to", err=True
@@ -49,7 +66,8 @@ class _Group(click.Group):
             ctx.exit(1)
         except OSError as err:
             click.echo(f"topograph: {err.filename or 'a file'}: {err.strerror or err}", err=True)
-            ctx.exit(InputError.exit_code)
+            full = err.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+            ctx.exit(TopographError.exit_code if full else InputError.exit_code)
         except Exception as err:
             if ctx.params.get("verbose"):
                 raise
@@ -73,6 +91,8 @@ def _one_arena() -> None:
 def main(verbose: bool) -> None:
     """Topological maps of orchards from robot recordings, by factor graph."""
     _one_arena()
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, _end)
     logging.basicConfig(level=logging.DEBUG if verbose else logging.ERROR, format="%(name)s: %(message)s")
     if not verbose:
         logging.getLogger("topograph").setLevel(logging.WARNING)
@@ -145,7 +165,7 @@ def config_of(config_file: Path | None, words: dict[str, Any]) -> Any:
             values = tuple(float(x) for x in numbers.split(","))
         except ValueError:
             values = ()
-        if len(values) != 6 or not frame:
+        if len(values) != 6 or not frame or not all(map(math.isfinite, values)):
             raise UsageError(f"--extrinsic {word}: give FRAME=X,Y,Z,ROLL,PITCH,YAW, metres and radians")
         mounts[frame] = values
     if mounts:
@@ -190,6 +210,10 @@ def results_folder(folder: Path | None) -> Iterator[Path]:
     fails leaves no empty folder."""
     given = folder is not None
     root = Path("results")
+    if not given and (root / "latest").is_dir() and not (root / "latest").is_symlink():
+        raise UsageError(
+            "results/latest is a folder, not the link that this program makes: move it away, or give --results"
+        )
     out = folder if folder is not None else root / datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S_%f")
     made = [p for p in (out, *out.parents) if not p.exists()]
     out.mkdir(parents=True, exist_ok=True)
@@ -217,9 +241,24 @@ def hash_of(path: Path, stop: threading.Event) -> str:
     return h.hexdigest()
 
 
+def check_output(output: Path | None, inputs: Sequence[Path], suffixes: Sequence[str]) -> None:
+    """Raise UsageError where a result would be written over an input, or under a name that says otherwise."""
+    if output is None:
+        return
+    if output.resolve() in {p.resolve() for p in inputs}:
+        raise UsageError(f"{output}: is an input; nothing is written over it")
+    if output.suffix not in suffixes:
+        raise UsageError(f"{output}: end the name in {' or '.join(suffixes)}")
+
+
 @contextmanager
-def hashed(paths: Sequence[Path]) -> Iterator[Callable[[], list[dict[str, str]]]]:
-    """Names and hashes of files, computed beside the reading: what one of the two has read, the other finds in memory."""
+def hashed(paths: Sequence[Path], whole: bool = True) -> Iterator[Callable[[], list[dict[str, str]]]]:
+    """Names and hashes of files, computed beside the reading: what one of the two has read, the other finds in memory. Not `whole`, a
+    part is read, and its file is told by its size.
+    """
+    if not whole:
+        yield lambda: [{"path": p.name, "bytes": str(p.stat().st_size)} for p in paths if p.exists()]
+        return
     stop = threading.Event()
     with ThreadPoolExecutor(1) as pool:
         waiting = [(p.name, pool.submit(hash_of, p, stop)) for p in paths if p.exists()]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -73,7 +75,11 @@ def live(
         if quiet or now - said[0] < every:
             return
         said[0] = now
-        click.echo(line(s))
+        try:
+            click.echo(line(s))
+        except BrokenPipeError:  # whoever listened has gone; the map is still wanted
+            said[0] = np.inf
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
     with ExitStack() as stack:
         folder = stack.enter_context(results_folder(results))

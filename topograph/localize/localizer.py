@@ -33,6 +33,8 @@ HEADING_FLOOR = 0.004
 
 log = logging.getLogger(__name__)
 
+FAR_AHEAD_NS = 600_000_000_000
+"""No odometry is so late."""
 UNKNOWN_S = 1.0
 """Of driving that a clock which was set back hides."""
 CLOCK_SET = 3
@@ -81,6 +83,11 @@ class Localizer:
             self._heard_ns = m.stamp_ns
         if scan.stamp_ns <= 0 and self._heard_ns > 0:
             scan = replace(scan, stamp_ns=self._heard_ns)  # a driver that does not stamp: the newest message's time
+        if self._heard_ns and scan.stamp_ns > self._heard_ns + FAR_AHEAD_NS:
+            log.warning(
+                "a scan is stamped %.0f s ahead of all odometry: passed over", (scan.stamp_ns - self._heard_ns) * 1e-9
+            )
+            return None
         if self.report is not None and scan.stamp_ns < self.report.stamp_ns:
             self._old += 1
             if self._old < CLOCK_SET:

@@ -18,6 +18,8 @@ from topograph.session import Session, StreamsBuilder, unknown_mounts
 
 FIRST_S = 5.0
 """Before so much was recorded there is no map worth the name."""
+FAR_NS = 60_000_000_000
+"""A scan that is stamped further from everything else was stamped by another clock."""
 DUTY = 4.0
 """Between two solves lies so many times what the last one took: mapping costs a quarter of a core, however long the run."""
 
@@ -61,12 +63,28 @@ class Mapper:
     def process(self, trunks: Trunks, messages: Iterable[Odometry | Imu | Fix | Heading] = ()) -> bool:
         """One scan's trunks in `base_link`, and the messages since the last; whether it is time to solve."""
         self.hear(messages)
+        trunks = self._sound(trunks)
+        if not self._in_time(trunks.stamp_ns):
+            self.skipped["scan: stamped far from all other messages"] += 1
+            return False
         self._trunks.append(trunks)
         now = trunks.stamp_ns
         if self._start_ns is None:
             self._start_ns = now
         since = (now - (self._start_ns if self._solved_ns is None else self._solved_ns)) * 1e-9
         return since >= max(FIRST_S, DUTY * self.took)
+
+    @staticmethod
+    def _sound(trunks: Trunks) -> Trunks:
+        """The trunks that are somewhere, and point somewhere."""
+        ok = np.isfinite(trunks.p).all(axis=1) & np.isfinite(trunks.axis).all(axis=1)
+        ok &= np.linalg.norm(trunks.axis, axis=1) > 0.5
+        return trunks if ok.all() else trunks.select(ok)
+
+    def _in_time(self, stamp_ns: int) -> bool:
+        """A scan's stamp is near the newest message of wheels or IMU, or near the last scan's."""
+        near = [m[-1].stamp_ns for m in (self._builder.odometry, self._builder.imu, self._trunks) if m]
+        return not near or min(abs(stamp_ns - n) for n in near) < FAR_NS
 
     def session(self) -> Session:
         """What came so far."""

@@ -24,6 +24,8 @@ def audited(solved: Solved) -> Verdict:
         *_unclaimed(solved),
         *_mounts(solved),
     ]
+    if any(f.name == "moving" for f in found):  # the same cause, and said of it
+        found = [f for f in found if f.name != "trunks of no tree"]
     return Verdict(tuple(sorted(found, key=lambda f: (not f.refuses, -f.value / f.bound))))
 
 
@@ -37,7 +39,8 @@ def _of_gnss(solved: Solved) -> Iterator[Finding]:
 
 
 def _unclaimed(solved: Solved) -> Iterator[Finding]:
-    trunks = solved.run.trunks
+    first, last = solved.motion.stamps_ns[[0, -1]]  # what dead reckoning does not cover cannot be mapped
+    trunks = [t for t in solved.run.trunks if first <= t.stamp_ns <= last]
     if not trunks:
         return
     d = solved.detections

@@ -79,6 +79,7 @@ def compare_runs(
                 continue
             chosen = replace(config, trunks=replace(config.trunks, front_end=front_end))
             w.heard[front_end, out.runs[n]] = hear([path], chosen)
+        out.notes += [f"{out.runs[n]}: {said}" for said in w.heard["organised", out.runs[n]].session.notes]
     progress("read", 1.0)
     if w.one_front_end:
         out.notes.append(

@@ -80,7 +80,7 @@ def localize_bags(
         player = _Player(out, lambda heard: _begin(topo, recording, heard, config, method, out.notes))
         for m in stream(recording, config, partial(_show, progress), span_s):
             player.take(m)
-        refuse_damaged(recording)
+        refuse_damaged(recording, span_s != WHOLE)
         out.notes += [*recording.notes, *recording.clocks.notes]
     out.seconds["read, detect and localize"] = time.perf_counter() - began
     player.finish(progress)

@@ -55,6 +55,8 @@ def why_no_trees(solved: Solved) -> str:
     """One line on why a map has no trees; "" when it has some."""
     if solved.problem.n_trees:
         return ""
+    if solved.run.scans == 0 and {"points", "trunks"} & set(solved.run.chosen):
+        return "no trunks: no scan could be used in the part of the recording that was read (see what was skipped, and --from, --to)"
     if solved.run.scans == 0:
         return "no trunks: the recording has no point cloud and no trunk detections (name one with --topic-points or --topic-trunks)"
     return f"no trunks: none of {solved.run.scans} scans showed a tree often enough to be mapped"

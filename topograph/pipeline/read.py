@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from topograph.bags import DAMAGED, UNDECODED, Fix, Heading, Imu, Odometry, Recording, Scan, Trunks
+from topograph.bags import DAMAGED, EMPTY, INFINITE, UNDECODED, Fix, Heading, Imu, Odometry, Recording, Scan, Trunks
 from topograph.config import Config
 from topograph.errors import InputError
 from topograph.geometry import Array, inverse
@@ -141,7 +141,8 @@ def read_run(
                     trunks.append(product)
                 else:
                     builder.add(product)
-        refuse_damaged(recording)
+        refuse_damaged(recording, span_s != WHOLE)
+        notes += _undecoded(recording)
         notes += [*recording.notes, *recording.clocks.notes]
         streams = builder.build(recording.skipped)
         mounts: dict[str, Array | None] = {
@@ -152,6 +153,9 @@ def read_run(
             notes.append(_smear(streams, trunks))
         child_T_robot = child_mount(recording, streams.frames.get("child", ""), config, notes)
         skipped = recording.skipped
+        announced = {
+            k: recording.given[k] if span_s != WHOLE else recording.counts[t] for k, t in recording.chosen.items()
+        }
         chosen, duration, start_ns = dict(recording.chosen), recording.duration_s, recording.start_ns
     return Session(
         streams=streams,
@@ -165,6 +169,7 @@ def read_run(
         seconds=time.perf_counter() - began,
         duration_s=duration,
         start_ns=start_ns,
+        announced=announced,
     )
 
 
@@ -172,17 +177,36 @@ MOST_DAMAGED = 0.2
 """Share of a needed stream that may be damaged."""
 
 
-def refuse_damaged(recording: Recording) -> None:
-    """Raise InputError where a needed stream is mostly damaged: what is left of it would pass for the whole."""
+def refuse_damaged(recording: Recording, part: bool = False) -> None:
+    """Raise InputError where a needed stream is mostly damaged: what is left of it would pass for the whole. Of a `part` of a recording
+    those count that lie in it.
+    """
     for kind in ("points", "trunks", "odometry"):
         topic = recording.chosen.get(kind)
-        bad = sum(recording.skipped.get(f"{kind}: {why}", 0) for why in (DAMAGED, UNDECODED, BROKE))
-        if topic is None or bad <= MOST_DAMAGED * recording.counts[topic]:
+        bad = sum(recording.skipped.get(f"{kind}: {why}", 0) for why in (DAMAGED, UNDECODED, BROKE, INFINITE, EMPTY))
+        if topic is None:
+            continue
+        of = recording.given[kind] if part else recording.counts[topic]
+        if bad <= MOST_DAMAGED * of:
             continue
         why = recording.undecoded.get(
             kind, "the file is damaged; restore a copy of it, or cut the sound part out with --from and --to"
         )
-        raise InputError(f"{topic}: {bad} of {recording.counts[topic]} messages cannot be read ({why})")
+        what = {k.partition(": ")[2] for k in recording.skipped if k.startswith(f"{kind}: ")} & {INFINITE, EMPTY}
+        if what:
+            why = f"{', '.join(sorted(what))}: the sensor or its driver is at fault; cut the sound part out with --from and --to"
+        raise InputError(f"{topic}: {bad} of {of} messages cannot be used ({why})")
+
+
+def _undecoded(recording: Recording) -> list[str]:
+    """What to say of streams whose messages could not be decoded or held no number."""
+    out = []
+    for kind, topic in recording.chosen.items():
+        bad = sum(recording.skipped.get(f"{kind}: {why}", 0) for why in (UNDECODED, INFINITE, EMPTY))
+        if bad:
+            why = recording.undecoded.get(kind, "no finite number in them")
+            out.append(f"{topic}: {bad} of {recording.given[kind]} messages cannot be used ({why})")
+    return out
 
 
 UNTIMED = 0.02

@@ -69,7 +69,7 @@ def play(
                 say(state)
         except KeyboardInterrupt:
             out.notes.append("stopped by hand: what came until then is mapped")
-        refuse_damaged(recording)
+        refuse_damaged(recording, span_s != WHOLE)
         if live is None:
             raise InsufficientDataError("no scan in the recording (or in the part that was asked for)")
         live.mapper.hear(heard)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
 import numpy as np
@@ -36,6 +36,7 @@ class Session:
         notes: what had to be assumed.
         scans, seconds, duration_s: counted, spent reading and detecting, recorded.
         start_ns: when the recording began.
+        announced: stream kind -> messages that there were; those not among `skipped` were used.
     """
 
     streams: Streams
@@ -49,6 +50,7 @@ class Session:
     seconds: float
     duration_s: float
     start_ns: int
+    announced: dict[str, int] = field(default_factory=dict)
 
     @property
     def id(self) -> str:

@@ -63,6 +63,24 @@ class Streams:
         return np.asarray(np.sqrt(self.fix_cov[:, [0, 1], [0, 1]].max(axis=1)))
 
 
+UNSOUND = "not finite, or no rotation"
+
+
+def _sound(m: Odometry | Imu | Fix | Heading) -> bool:
+    """It holds numbers that mean something."""
+    if isinstance(m, Imu):
+        values = np.concatenate([m.gyro, m.accel])
+    elif isinstance(m, Odometry):
+        values = np.concatenate([m.odom_T_child, m.twist])
+        if not 1e-6 < np.abs(m.odom_T_child[3:]).max() < 1e3:  # False for NaN
+            return False
+    elif isinstance(m, Heading):
+        values = np.array([m.yaw])
+    else:
+        return True  # fixes have a door of their own
+    return bool((np.abs(values) < 1e9).all())
+
+
 class StreamsBuilder:
     """Collects messages as they are read; the newest of odometry and IMU are there for deskewing."""
 
@@ -71,9 +89,13 @@ class StreamsBuilder:
         self.imu: list[Imu] = []
         self.fixes: list[Fix] = []
         self.headings: list[Heading] = []
+        self.unsound: Counter[str] = Counter()
 
     def add(self, message: Odometry | Imu | Fix | Heading) -> None:
-        """Append one message."""
+        """Append one message; what is not finite is passed over and counted (recordings have been through such a door already)."""
+        if not _sound(message):
+            self.unsound[f"{type(message).__name__.lower()}: {UNSOUND}"] += 1
+            return
         if isinstance(message, Imu):
             self.imu.append(message)
         elif isinstance(message, Odometry):
@@ -85,6 +107,7 @@ class StreamsBuilder:
 
     def build(self, skipped: Counter[str]) -> Streams:
         """Arrays in time order; repeated stamps and unusable fixes are dropped and counted."""
+        skipped.update(self.unsound)
         odometry = _in_order(self.odometry, "odometry", skipped)
         imu = _in_order(self.imu, "imu", skipped)
         fixes = _moving([f for f in map(_flat, _in_order(self.fixes, "fix", skipped)) if _usable(f, skipped)], skipped)

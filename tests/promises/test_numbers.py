@@ -16,10 +16,10 @@ from topograph.estimate.inertia import inertia
 from topograph.evaluate import Metric, Truth, map_metrics, world_in_map
 from topograph.evaluate.localization import localization_errors, path_errors
 from topograph.evaluate.metrics import match
+from topograph.exchange import write
 from topograph.geometry import Array, Datum, interpolate, inverse, planar, transform, wrap, yaw_of
 from topograph.motion import Inertial
 from topograph.pipeline import Solved, audited, baseline, localize_bags, map_T_scans, read_run, solve_run, topo_map
-from topograph.report.export import write
 from topograph.report.page import show
 from topograph.simulate import DESIGNS, DriveConfig, SensorConfig, record
 from topograph.simulate.detections import DetectionNoise

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Sequence
+from dataclasses import fields as fields_of
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,18 @@ _EXTRA = {
     "pcl_processing/msg/Cluster": "uint32 num_points\ngeometry_msgs/Point centroid\nsensor_msgs/PointCloud2 cloud",
     "pcl_processing/msg/ClusterArray": "std_msgs/Header header\npcl_processing/Cluster[] clusters",
 }
+
+
+CYLINDER, LINE_LIST, TEXT = 3, 5, 9
+"""Of visualization_msgs/Marker."""
+
+
+def _upright(axis: Array) -> Array:
+    """Quaternion (4,) x y z w that turns the vertical onto an axis (3,)."""
+    x, y, z = np.asarray(axis, float)
+    q = np.array([-y, x, 0.0, 1.0 + z])
+    n = float(np.linalg.norm(q))
+    return q / n if n > 1e-9 else np.array([1.0, 0.0, 0.0, 0.0])
 
 
 class BagWriter:
@@ -213,6 +227,64 @@ class BagWriter:
             quaternion=self._quaternion(quaternion),
         )
         self._write(topic, "geometry_msgs/msg/QuaternionStamped", log_ns, message)
+
+    def trajectory(self, topic: str, log_ns: int, frame: str, stamps_ns: NDArray[np.int64], poses: Array) -> None:
+        """A Path of poses (N, 4, 4)."""
+        stamped = [
+            self._msg("geometry_msgs/msg/PoseStamped", header=self._header(int(s), frame), pose=self._pose(T))
+            for s, T in zip(stamps_ns, poses, strict=True)
+        ]
+        message = self._msg("nav_msgs/msg/Path", header=self._header(log_ns, frame), poses=stamped)
+        self._write(topic, "nav_msgs/msg/Path", log_ns, message)
+
+    def markers(
+        self, topic: str, log_ns: int, frame: str, trunks: Sequence[tuple[Array, Array, float, tuple[float, ...]]],
+        lines: Array, names: Sequence[tuple[Array, str]],
+    ) -> None:  # fmt: skip
+        """A MarkerArray: a cylinder for each trunk (middle, axis, diameter, colour), `lines` (2E, 3) from each second point to the next, and
+        texts at places.
+        """
+        out = [
+            self._marker(log_ns, frame, "trees", k, CYLINDER, (d, d, 1.5), color, middle, _upright(axis))
+            for k, (middle, axis, d, color) in enumerate(trunks)
+        ]
+        ends = [self._point(p) for p in lines]
+        out.append(
+            self._marker(log_ns, frame, "edges", 0, LINE_LIST, (0.03, 0.0, 0.0), (0.6, 0.65, 0.6, 1.0), points=ends)
+        )
+        out += [
+            self._marker(log_ns, frame, "names", k, TEXT, (0.0, 0.0, 0.35), (0.1, 0.1, 0.1, 1.0), at, text=text)
+            for k, (at, text) in enumerate(names)
+        ]
+        message = self._msg("visualization_msgs/msg/MarkerArray", markers=out)
+        self._write(topic, "visualization_msgs/msg/MarkerArray", log_ns, message)
+
+    def _marker(
+        self, stamp_ns: int, frame: str, ns: str, number: int, kind: int, scale: Sequence[float], color: Sequence[float],
+        at: Any = (0.0, 0.0, 0.0), turn: Any = (0.0, 0.0, 0.0, 1.0), points: Sequence[Any] = (), text: str = "",
+    ) -> Any:  # fmt: skip
+        pose = self._msg("geometry_msgs/msg/Pose", position=self._point(at), orientation=self._quaternion(turn))
+        tint = self._msg("std_msgs/msg/ColorRGBA", **dict(zip("rgba", map(float, color), strict=True)))
+        fields = {
+            "header": self._header(stamp_ns, frame), "ns": ns, "id": number, "type": kind, "action": 0, "pose": pose,
+            "scale": self._vector(scale), "color": tint,
+            "lifetime": self._msg("builtin_interfaces/msg/Duration", sec=0, nanosec=0), "frame_locked": False,
+            "points": list(points), "colors": [], "text": text, "mesh_resource": "", "mesh_use_embedded_materials": False,
+        }  # fmt: skip
+        typ = "visualization_msgs/msg/Marker"
+        known = {f.name for f in fields_of(cast(Any, self._store.types[typ]))}
+        for name in known:  # later ROS 2 has textures, and they are empty
+            if name not in fields and name != "__msgtype__":
+                fields[name] = self._empty(name)
+        return self._msg(typ, **{k: v for k, v in fields.items() if k in known})
+
+    def _empty(self, name: str) -> Any:
+        if name == "texture":
+            header = self._header(0, "")
+            return self._msg("sensor_msgs/msg/CompressedImage", header=header, format="", data=np.zeros(0, np.uint8))
+        if name == "mesh_file":
+            return self._msg("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8))
+        return [] if name == "uv_coordinates" else ""
 
     def trunks(
         self, topic: str, log_ns: int, stamp_ns: int, frame: str, p: Array, diameter: Array, quaternion: Array

@@ -464,11 +464,25 @@ def repair(map_file: Path, output: Path) -> None:
 @click.argument("map_file", type=click.Path(path_type=Path))
 @click.argument("output", type=click.Path(path_type=Path))
 def export(map_file: Path, output: Path) -> None:
-    """Write MAP_FILE's trees as .geojson or .csv, its path as .tum, or its clouds as .ply."""
-    from topograph import store
-    from topograph.report.export import write
+    """Write MAP_FILE in the format that OUTPUT's suffix names.
 
-    write(store.load(map_file, clouds=output.suffix == ".ply"), output)
+    \b
+    .geojson .csv .kml .parquet   trees
+    .graphml                      the graph
+    .tum                          the path
+    .ply .pcd .las .laz           clouds
+    .mcap .bag                    markers, path, clouds for Foxglove and RViz
+    """
+    from topograph import store
+    from topograph.exchange import WRITERS, write
+
+    if output.resolve() == map_file.resolve():
+        raise UsageError(f"{output}: is an input; nothing is written over it")
+    if output.suffix not in WRITERS:
+        raise UsageError(f"{output}: end the name in one of {', '.join(WRITERS)}")
+    if not output.parent.is_dir():
+        raise UsageError(f"{output}: there is no folder {output.parent}")
+    write(store.load(map_file, clouds=WRITERS[output.suffix][2]), output)
     click.echo(f"written: {output}")
 
 

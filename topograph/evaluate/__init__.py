@@ -3,7 +3,8 @@
 from topograph.evaluate.frames import WorldInMap, world_in_map
 from topograph.evaluate.metrics import Metric, fix_metrics, map_metrics, path_metrics, trunk_metrics, truth_metrics
 from topograph.evaluate.references import read_truth
-from topograph.evaluate.truth import Truth, read_tum, write_tum
+from topograph.evaluate.truth import Truth
+from topograph.exchange import read_tum, write_tum
 
 __all__ = [
     "Metric",

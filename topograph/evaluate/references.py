@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from topograph.errors import InputError
-from topograph.evaluate.truth import Truth, read_tum
+from topograph.evaluate.truth import Truth
+from topograph.exchange import read_tum
 from topograph.geometry import Array, Datum
 
 

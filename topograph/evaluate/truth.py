@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from topograph.errors import InputError
-from topograph.geometry import Array, Datum, Stamps, from_quaternion, to_quaternion
+from topograph.exchange.tum import read_tum, write_tum
+from topograph.geometry import Array, Datum, Stamps
 
 _COLUMNS = ("id", "lat", "lon", "h", "x", "y", "z", "axis_x", "axis_y", "axis_z", "diameter", "stems")
 
@@ -118,33 +119,3 @@ class Truth:
 
 def _no_returns(n: int) -> tuple[Stamps, NDArray[np.int32]]:
     return np.zeros(0, np.int64), np.zeros((0, n), np.int32)
-
-
-def write_tum(path: Path, stamps_ns: Stamps, poses: Array) -> None:
-    """Poses (N, 4, 4) as TUM: stamp in seconds with 9 decimals, x y z, quaternion x y z w."""
-    q = to_quaternion(poses) if len(poses) else np.zeros((0, 4))
-    with path.open("w") as f:
-        for s, T, r in zip(stamps_ns.tolist(), poses, q, strict=True):
-            values = " ".join(f"{v:.9f}" for v in (*T[:3, 3], *r))
-            f.write(f"{s // 1_000_000_000}.{s % 1_000_000_000:09d} {values}\n")
-
-
-def read_tum(path: Path) -> tuple[Stamps, Array]:
-    """Stamps (N,) in ns and poses (N, 4, 4) of a TUM file; stamps are read without rounding through floats.
-
-    Raises:
-        InputError: a line has not eight numbers.
-    """
-    stamps: list[int] = []
-    rows: list[list[float]] = []
-    for n, line in enumerate(path.read_text().splitlines(), 1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        words = line.split()
-        if len(words) != 8:
-            raise InputError(f"{path}:{n}: {len(words)} columns, TUM has 8 (stamp x y z qx qy qz qw)")
-        whole, _, fraction = words[0].partition(".")
-        stamps.append(int(whole) * 1_000_000_000 + int((fraction + "000000000")[:9]))
-        rows.append([float(w) for w in words[1:]])
-    values = np.array(rows).reshape(-1, 7)
-    return np.array(stamps, np.int64), from_quaternion(values[:, :3], values[:, 3:]).reshape(-1, 4, 4)

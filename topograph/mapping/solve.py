@@ -143,7 +143,7 @@ def prepare(
         notes.append("no IMU: turns rest on the wheels, the slope on GNSS and trunks")
     detections = _covered(Detections.of(run.trunks), motion, notes)
     if screened:
-        motion = with_trunks_way(motion, detections)
+        motion = with_trunks_way(motion, detections, streams.fix_ns)
     notes += _wheel_notes(motion)
     track, moving = np.arange(len(detections)), 0.0
     if screened:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse
-from numpy.typing import NDArray
 
 from topograph.bags import Scan, Trunks
 from topograph.geometry import Array, transform
@@ -148,10 +147,3 @@ def scan_figure(scan: Scan, base_T_lidar: Array, trunks: Trunks, true: Array | N
     ax.set_ylabel("y [m], left")
     ax.set_title(f"{len(trunks)} trunks (numbers: log-odds)")
     return _png(figure)
-
-
-def cloud_points(topo: TopoMap, rows: Sequence[int]) -> NDArray[np.float32]:
-    """Points (M, 3) of all viewpoint clouds of some nodes, in the map frame."""
-    wanted = set(rows)
-    parts = [v.cloud + topo.p[v.tree].astype(np.float32) for v in topo.viewpoints if v.tree in wanted]
-    return np.concatenate([*parts, np.zeros((0, 3), np.float32)])

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from topograph.geometry import Array, inverse, planar, transform, yaw_of
+from topograph.geometry import Array, Stamps, inverse, planar, transform, yaw_of
 from topograph.motion import Leg, Motion
 from topograph.trees.detections import Detections
 from topograph.trees.slip import LONGEST_S, OFF, REACH, SHARE, SIGMAS, between
@@ -21,20 +21,28 @@ GAP_NS = 500_000_000
 """Scans further apart do not tell of a slip: trunks might be taken for their neighbours."""
 LEGS = 5
 """Legs of a window, at least."""
+WITNESSES = 3
+"""Trunks in both scans, at least."""
+WITHOUT_NS = 3_000_000_000
+"""Fixes further apart than this leave the wheels unjudged between them."""
+CELL, RIDES = 0.4, 0.12
+"""A place of so many metres in the robot's frame where something is in so large a share of the scans."""
 MOST = 0.3
 """Share of a run that may slip; beyond it, it is no slip but the mounting, the clock or the scale."""
 PART = 0.25
 """A leg in a window that slips belongs to the slip when it is off by so much of the window's mean."""
 
 
-def with_trunks_way(motion: Motion, d: Detections) -> Motion:
-    """The motion with the trunks' way where they contradict the wheels; itself where they do not."""
+def with_trunks_way(motion: Motion, d: Detections, fix_ns: Stamps) -> Motion:
+    """The motion with the trunks' way where they contradict the wheels; itself where they do not. Where there are fixes, at `fix_ns` (F,),
+    these have judged the wheels already, and trunks, some of which may be people, are not asked.
+    """
     if not motion.wheels or len(d) == 0 or len(d.stamps_ns) < 3 * LEGS:
         return motion
     ns, legs = _legs(motion, d)
     if len(legs) < LEGS:
         return motion
-    slipping = _slipping(ns, legs)
+    slipping = _slipping(ns, legs) & ~_near(fix_ns, ns)
     driven = np.hypot(legs[:, 2], legs[:, 3])
     if not slipping.any() or slipping.sum() > MOST * max(int((driven > 0.01).sum()), 1):
         return motion
@@ -47,7 +55,7 @@ def _legs(motion: Motion, d: Detections) -> tuple[NDArray[np.int64], Array]:
     up = planar(odom_T_robot[:, 0, 3], odom_T_robot[:, 1, 3], yaw_of(odom_T_robot))
     up[:, 2, 3] = odom_T_robot[:, 2, 3]
     flat = transform((inverse(up) @ odom_T_robot)[d.scan], d.p)[:, :2]
-    use = (np.hypot(*flat.T) < REACH) & (d.score >= 0)
+    use = (np.hypot(*flat.T) < REACH) & (d.score >= 0) & ~_rides(flat, d)
     order = np.argsort(d.scan[use], kind="stable")
     rows = np.flatnonzero(use)[order]
     ends = np.searchsorted(d.scan[rows], np.arange(len(d.stamps_ns) + 1))
@@ -61,10 +69,28 @@ def _legs(motion: Motion, d: Detections) -> tuple[NDArray[np.int64], Array]:
         c, s = np.cos(yaw[a]), np.sin(yaw[a])
         step = np.array([c * way[0] + s * way[1], -s * way[0] + c * way[1], yaw[b] - yaw[a]])
         found = between(last, now, Leg(step=step, distance=0.0, turned=0.0, seconds=0.0))
-        if found is not None:
+        if found is not None and min(len(last), len(now)) >= WITNESSES:
             spans.append((d.stamps_ns[a], d.stamps_ns[b]))
             legs.append((*found[0][:2], *step[:2], found[1][0]))
     return np.array(spans, np.int64).reshape(-1, 2), np.array(legs).reshape(-1, 5)
+
+
+def _near(fix_ns: Stamps, ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(L,) legs with a fix before and after them that is not far."""
+    if len(fix_ns) < 2:
+        return np.zeros(len(ns), bool)
+    after = np.clip(np.searchsorted(fix_ns, ns[:, 1]), 1, len(fix_ns) - 1)
+    inside = (ns[:, 0] >= fix_ns[0]) & (ns[:, 1] <= fix_ns[-1])
+    return np.asarray(inside & (fix_ns[after] - fix_ns[after - 1] < WITHOUT_NS))
+
+
+def _rides(flat: Array, d: Detections) -> NDArray[np.bool_]:
+    """(N,) detections at places beside the robot where nearly always something is: what rides along says that the robot stands."""
+    cell = np.floor(flat / CELL).astype(np.int64)
+    _, of = np.unique(cell, axis=0, return_inverse=True)
+    scans = np.unique(np.column_stack([of.ravel(), d.scan]), axis=0)
+    often = np.bincount(scans[:, 0], minlength=int(of.max(initial=0)) + 1) > RIDES * len(d.stamps_ns)
+    return np.asarray(often[of.ravel()])
 
 
 def _slipping(ns: NDArray[np.int64], legs: Array) -> NDArray[np.bool_]:

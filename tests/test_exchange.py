@@ -1,0 +1,152 @@
+"""Every product opens in its own format's library, and says what the map says."""
+
+import csv
+import json
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+from test_cli import call
+from test_store import make
+
+from topograph import store
+from topograph.errors import UsageError
+from topograph.exchange import WRITERS, read_tum, write
+
+MAP = make(12)
+
+
+@pytest.fixture
+def written(tmp_path: Path):
+    def do(suffix: str) -> Path:
+        path = tmp_path / f"out{suffix}"
+        write(MAP, path)
+        assert [p.name for p in tmp_path.iterdir()] == [path.name]  # nothing half done beside it
+        return path
+
+    return do
+
+
+def test_csv(written) -> None:
+    rows = list(csv.DictReader(written(".csv").read_text().splitlines()))
+    np.testing.assert_array_equal([float(r["x"]) for r in rows], MAP.p[:, 0])
+    np.testing.assert_array_equal([int(r["id"]) for r in rows], MAP.ids)
+    assert {r["kind"] for r in rows} <= {"tree", "post", "other"}
+
+
+def test_geojson(written) -> None:
+    f = json.loads(written(".geojson").read_text())["features"]
+    lon_lat_h = np.array([x["geometry"]["coordinates"] for x in f])
+    np.testing.assert_allclose(lon_lat_h[:, [1, 0, 2]], MAP.geodetic())
+    assert abs(lon_lat_h[0, 1] - MAP.datum.lat) < 0.1  # latitude stands second
+
+
+def test_kml(written) -> None:
+    root = ET.parse(written(".kml")).getroot()
+    ns = {"k": "http://www.opengis.net/kml/2.2"}
+    places = [p.text.split(",") for p in root.findall(".//k:Point/k:coordinates", ns)]
+    np.testing.assert_allclose(np.array(places, float)[:, [1, 0, 2]], MAP.geodetic())
+    assert len(root.findall(".//k:LineString", ns)) == 1
+
+
+def test_geoparquet(written) -> None:
+    geopandas = pytest.importorskip("geopandas")
+    frame = geopandas.read_parquet(written(".parquet"))
+    assert frame.crs.to_epsg() == 4326
+    np.testing.assert_allclose(frame.geometry.y, MAP.geodetic()[:, 0])
+    np.testing.assert_allclose(frame["diameter"], MAP.diameter)
+
+
+def test_graphml(written) -> None:
+    networkx = pytest.importorskip("networkx")
+    g = networkx.read_graphml(written(".graphml"))
+    assert g.number_of_nodes() == len(MAP)
+    got = {frozenset(map(int, e)): d["length"] for *e, d in g.edges(data=True)}
+    for (a, b), length in zip(MAP.edges, MAP.lengths, strict=True):
+        assert got[frozenset((int(MAP.ids[a]), int(MAP.ids[b])))] == length
+    assert g.nodes[str(MAP.ids[0])]["x"] == MAP.p[0, 0]
+
+
+def test_tum(written) -> None:
+    stamps, poses = read_tum(written(".tum"))
+    np.testing.assert_array_equal(stamps, MAP.stamps_ns)
+    np.testing.assert_allclose(poses, MAP.map_T_robot, atol=1e-8)
+
+
+def cloud() -> np.ndarray:
+    return np.concatenate([v.cloud + MAP.p[v.tree] for v in MAP.viewpoints])
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd"])
+def test_clouds_open_in_open3d(written, suffix: str) -> None:
+    from topograph.trunks.open3d_door import open3d
+
+    got = np.asarray(open3d().io.read_point_cloud(str(written(suffix))).points)
+    np.testing.assert_allclose(got, cloud(), atol=1e-3)
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_clouds_open_in_laspy(written, suffix: str) -> None:
+    laspy = pytest.importorskip("laspy")
+    got = laspy.read(written(suffix))
+    np.testing.assert_allclose(np.column_stack([got.x, got.y, got.z]), cloud(), atol=1.1e-3)
+    assert set(got.point_source_id) == {int(MAP.ids[v.tree]) for v in MAP.viewpoints if len(v.cloud)}
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".bag"])
+def test_ros_topics_of_the_thesis(written, suffix: str) -> None:
+    with AnyReader([written(suffix)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        got = {c.topic: reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages()}
+    markers = got["/topological_map"].markers
+    trunks = [m for m in markers if m.ns == "trees"]
+    assert len(trunks) == len(MAP)
+    m, axis = trunks[0], MAP.axis[0]
+    q = m.pose.orientation
+    up = [2 * (q.x * q.z + q.w * q.y), 2 * (q.y * q.z - q.w * q.x), 1 - 2 * (q.x**2 + q.y**2)]
+    np.testing.assert_allclose(up, axis, atol=1e-9)  # the cylinder leans as the tree does
+    np.testing.assert_allclose([m.pose.position.x, m.pose.position.y], (MAP.p[0] + 0.75 * axis)[:2])
+    (edges,) = (m for m in markers if m.ns == "edges")
+    assert len(edges.points) == 2 * len(MAP.edges)
+    assert len(got["/path"].poses) == len(MAP.stamps_ns)
+    assert got["/clusters"].width == len(cloud())
+
+
+def test_what_a_map_cannot_fill_is_said(tmp_path: Path) -> None:
+    local = make(5, datum=None)
+    for suffix in (".geojson", ".kml"):
+        with pytest.raises(UsageError, match="not georeferenced"):
+            write(local, tmp_path / f"a{suffix}")
+    with pytest.raises(UsageError, match=r"\.geojson"):
+        write(local, tmp_path / "a.xyz")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_knows_all_of_them(tmp_path: Path) -> None:
+    store.save(MAP, tmp_path / "m.gpkg")
+    for suffix in WRITERS:
+        assert call("export", tmp_path / "m.gpkg", tmp_path / f"x{suffix}").exit_code == 0
+    before = (tmp_path / "m.gpkg").read_bytes()
+    assert call("export", tmp_path / "m.gpkg", tmp_path / "m.gpkg").exit_code == 2
+    assert (tmp_path / "m.gpkg").read_bytes() == before
+
+
+def test_gdal_finds_no_fault(tmp_path: Path) -> None:
+    """GDAL's own validator, where Debian's python3-gdal is installed."""
+    import subprocess
+
+    python = Path("/usr/bin/python3")
+    if (
+        not python.exists()
+        or subprocess.run([python, "-c", "import osgeo_utils.samples.validate_gpkg"], capture_output=True).returncode
+    ):
+        pytest.skip("python3-gdal is not installed")
+    for name, topo in (("a.gpkg", MAP), ("local.gpkg", make(9, datum=None))):
+        store.save(topo, tmp_path / name)
+        done = subprocess.run(
+            [python, "-m", "osgeo_utils.samples.validate_gpkg", tmp_path / name], capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert not done.stdout.strip(), done.stdout

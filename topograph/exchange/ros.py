@@ -1,0 +1,62 @@
+"""The map for RViz and Foxglove: the thesis's topics (5.2) as a ROS 1 bag or an MCAP file of ROS 2 messages."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from topograph.bags.writer import BagWriter
+from topograph.exchange.clouds import POINT, points
+from topograph.geometry import Array
+from topograph.topomap import KINDS, TopoMap
+
+FRAME = "map"
+COLORS = {"tree": (0.11, 0.47, 0.22, 1.0), "missing": (0.70, 0.09, 0.17, 1.0), "post": (0.48, 0.36, 0.24, 1.0)}
+SHOWN = 1.5
+"""Height of a trunk as it is drawn, m."""
+
+
+def write_ros(topo: TopoMap, path: Path) -> None:
+    """`/topological_map` (MarkerArray: trunks, edges, addresses), `/path` (Path), `/clusters` (PointCloud2 of all viewpoints)."""
+    if path.exists():
+        path.unlink()
+    folder = path if path.suffix == ".bag" else path.with_name(f".{path.stem}.ros2")
+    if folder.is_dir():
+        shutil.rmtree(folder)
+    stamp = int(topo.stamps_ns[-1]) if len(topo.stamps_ns) else 1
+    with BagWriter(folder) as bag:
+        bag.markers("/topological_map", stamp, FRAME, _trunks(topo), _edges(topo), _names(topo))
+        if len(topo.stamps_ns):
+            bag.trajectory("/path", stamp, FRAME, topo.stamps_ns, topo.map_T_robot)
+        if topo.viewpoints:
+            cloud = points(topo)
+            view = np.zeros(len(cloud), POINT)
+            view[:] = cloud
+            bag.points("/clusters", stamp, stamp, FRAME, view)
+    if folder != path:  # one file is what Foxglove opens
+        (folder / f"{folder.name}.mcap").replace(path)
+        shutil.rmtree(folder)
+
+
+def _trunks(topo: TopoMap) -> list[tuple[Array, Array, float, tuple[float, ...]]]:
+    """Middle (3,), axis (3,), diameter and colour of each landmark."""
+    out: list[tuple[Array, Array, float, tuple[float, ...]]] = []
+    for i, state in enumerate(topo.state):
+        kind = KINDS[int(topo.kind[i])]
+        color = COLORS["missing" if kind == "tree" and state == "missing" else "tree" if kind == "tree" else "post"]
+        d = float(topo.diameter[i]) if np.isfinite(topo.diameter[i]) else 0.2
+        out.append((topo.p[i] + 0.5 * SHOWN * topo.axis[i], topo.axis[i], d, color))
+    return out
+
+
+def _edges(topo: TopoMap) -> Array:
+    """(2E, 3) ends of the edges."""
+    return topo.p[topo.edges].reshape(-1, 3) if len(topo.edges) else np.zeros((0, 3))
+
+
+def _names(topo: TopoMap) -> list[tuple[Array, str]]:
+    return [
+        (topo.p[i] + np.array([0.0, 0.0, SHOWN + 0.4]), place or str(topo.ids[i])) for i, place in enumerate(topo.place)
+    ]

@@ -1,0 +1,106 @@
+"""Trees as tables and features: CSV, GeoJSON, KML, GeoParquet."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+from topograph.errors import UsageError
+from topograph.exchange.attributes import columns
+from topograph.exchange.whole import whole
+from topograph.topomap import TopoMap
+
+
+def write_csv(topo: TopoMap, path: Path) -> None:
+    """One row a landmark; empty where a value is not known."""
+    c = columns(topo)
+    with whole(path) as part, part.open("w", newline="") as f:
+        writer = csv.writer(f)
+        writer.writerow(c)
+        writer.writerows(zip(*c.values(), strict=True))
+
+
+def write_geojson(topo: TopoMap, path: Path) -> None:
+    """Points (RFC 7946): longitude, latitude, height."""
+    c = columns(georeferenced(topo, "GeoJSON"))
+    features = [
+        {
+            "type": "Feature",
+            "id": c["id"][i],
+            "geometry": {"type": "Point", "coordinates": [c["lon"][i], c["lat"][i], c["h"][i]]},
+            "properties": {k: v[i] for k, v in c.items() if k not in ("lat", "lon", "h")},
+        }
+        for i in range(len(topo))
+    ]
+    with whole(path) as part:
+        part.write_text(json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n")
+
+
+KML = "http://www.opengis.net/kml/2.2"
+
+
+def write_kml(topo: TopoMap, path: Path) -> None:
+    """Placemarks (OGC KML 2.2) named by their address, and the path as a line."""
+    c = columns(georeferenced(topo, "KML"))
+    ET.register_namespace("", KML)
+    root = ET.Element(f"{{{KML}}}kml")
+    document = ET.SubElement(root, f"{{{KML}}}Document")
+    for i in range(len(topo)):
+        mark = ET.SubElement(document, f"{{{KML}}}Placemark")
+        ET.SubElement(mark, f"{{{KML}}}name").text = c["place"][i] or str(c["id"][i])
+        data = ET.SubElement(mark, f"{{{KML}}}ExtendedData")
+        for k, v in c.items():
+            if v[i] is not None and k not in ("lat", "lon", "h"):
+                ET.SubElement(ET.SubElement(data, f"{{{KML}}}Data", name=k), f"{{{KML}}}value").text = str(v[i])
+        point = ET.SubElement(mark, f"{{{KML}}}Point")
+        ET.SubElement(point, f"{{{KML}}}coordinates").text = f"{c['lon'][i]!r},{c['lat'][i]!r},{c['h'][i]!r}"
+    if topo.datum is not None and len(topo.stamps_ns):
+        track = ET.SubElement(document, f"{{{KML}}}Placemark")
+        ET.SubElement(track, f"{{{KML}}}name").text = "path"
+        line = ET.SubElement(track, f"{{{KML}}}LineString")
+        g = topo.datum.to_geodetic(topo.map_T_robot[:, :3, 3])
+        text = " ".join(f"{lon!r},{lat!r},{h!r}" for lat, lon, h in g.tolist())
+        ET.SubElement(line, f"{{{KML}}}coordinates").text = text
+    with whole(path) as part:
+        ET.ElementTree(root).write(part, encoding="utf-8", xml_declaration=True)
+
+
+def write_parquet(topo: TopoMap, path: Path) -> None:
+    """GeoParquet, by geopandas."""
+    frame = geodataframe(topo)
+    with whole(path) as part:
+        frame.to_parquet(part)
+
+
+def geodataframe(topo: TopoMap) -> Any:
+    """The landmarks as a geopandas GeoDataFrame, EPSG:4326 with heights, or in the map's own frame without a datum.
+
+    Raises:
+        UsageError: geopandas is not installed.
+    """
+    try:
+        import geopandas
+    except ImportError as err:
+        raise UsageError("GeoParquet needs geopandas and pyarrow: pip install 'topograph[exchange]'") from err
+    c = columns(topo)
+    there = ("lon", "lat", "h") if topo.datum is not None else ("x", "y", "z")
+    points = geopandas.points_from_xy(*(c[k] for k in there))
+    return geopandas.GeoDataFrame(
+        {k: v for k, v in c.items() if k not in ("lon", "lat", "h")},
+        geometry=points,
+        crs=4326 if topo.datum is not None else None,
+    )
+
+
+def georeferenced(topo: TopoMap, what: str) -> TopoMap:
+    """The map, if it has a place on Earth.
+
+    Raises:
+        UsageError: it has none.
+    """
+    if topo.datum is None:
+        raise UsageError(f"the map is not georeferenced: {what} needs longitude and latitude; export .csv instead")
+    return topo

@@ -486,22 +486,6 @@ def export(map_file: Path, output: Path) -> None:
     click.echo(f"written: {output}")
 
 
-@main.command()
-@click.argument("map_file", type=click.Path(path_type=Path))
-@click.argument("output", type=click.Path(path_type=Path), default=Path("map.html"))
-def view(map_file: Path, output: Path) -> None:
-    """Write a self-contained page of MAP_FILE to open in a browser."""
-    from topograph import report, store
-    from topograph.evaluate.metrics import Metric, doubles
-
-    check_output(output, [map_file], (".html",))
-    topo = store.load(map_file, clouds=False)
-    metrics = [Metric("trees", int(topo.is_tree.sum())), Metric("edges", len(topo.edges)), doubles(topo)]
-    notes = [] if topo.datum is not None else ["not georeferenced: the frame is the first pose of the run"]
-    report.write_page(output, map_file.name, topo, metrics, {}, {}, notes, {"schema": "2"})
-    click.echo(f"written: {output}")
-
-
 @main.command("config")
 @click.option(
     "-c",

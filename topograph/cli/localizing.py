@@ -92,6 +92,7 @@ def localize(
         write_tum(folder / "localization.tum", np.array([f.stamp_ns for f in fixes], np.int64), poses)
         write_tum(folder / "smoothed.tum", *run.smoothed)
         write_text(folder / "localization.csv", _csv(run.reports))
+        write_text(folder / "hypotheses.csv", _hypotheses(run.reports))
         text = dump(config)
         write_text(folder / "config.yaml", text)
         figures = {"Localization": localization_figure(topo, run.reports)}
@@ -123,6 +124,25 @@ def localize(
         click.echo(f"note: {note}", err=True)
     table(metrics)
     click.echo(f"{said}; report: {folder / 'report.html'}")
+
+
+MOST_PLACES = 50
+"""Hypotheses of a scan that are written, the most probable first."""
+
+
+def _hypotheses(reports: Sequence[Any]) -> str:
+    """One row per place that a scan leaves, while there is no pose."""
+    lines = ["stamp,x,y,yaw,weight"]
+    for r in reports:
+        if r.fix is not None:
+            continue
+        stamp = f"{r.stamp_ns // 10**9}.{r.stamp_ns % 10**9:09d}"
+        n = min(len(r.places), MOST_PLACES)
+        weights = r.weights[:n] if len(r.weights) >= n else np.full(n, 1.0 / max(len(r.places), 1))
+        lines += [
+            f"{stamp},{x:.3f},{y:.3f},{yaw:.4f},{w:.5f}" for (x, y, yaw), w in zip(r.places[:n], weights, strict=True)
+        ]
+    return "\n".join(lines) + "\n"
 
 
 def verdict(reports: Sequence[Any], distance: Sequence[float]) -> str:

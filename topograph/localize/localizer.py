@@ -34,7 +34,7 @@ HEADING_FLOOR = 0.004
 log = logging.getLogger(__name__)
 
 FAR_AHEAD_NS = 600_000_000_000
-"""No odometry is so late."""
+"""No scan is so long in coming; several in a row, and it is the clock that was set."""
 UNKNOWN_S = 1.0
 """Of driving that a clock which was set back hides."""
 CLOCK_SET = 3
@@ -68,7 +68,7 @@ class Localizer:
         self.report: Report | None = None
         self._front_end = front_end
         self._heard_ns = 0
-        self._old = 0
+        self._old = self._ahead = 0
 
     def update(self, scan: Scan | Trunks, odometry: Iterable[Odometry | Imu] = ()) -> Fix | None:
         """One scan, and the odometry and IMU messages since the last one; the pose at the scan's stamp, or None.
@@ -83,17 +83,19 @@ class Localizer:
             self._heard_ns = m.stamp_ns
         if scan.stamp_ns <= 0 and self._heard_ns > 0:
             scan = replace(scan, stamp_ns=self._heard_ns)  # a driver that does not stamp: the newest message's time
-        if self._heard_ns and scan.stamp_ns > self._heard_ns + FAR_AHEAD_NS:
-            log.warning(
-                "a scan is stamped %.0f s ahead of all odometry: passed over", (scan.stamp_ns - self._heard_ns) * 1e-9
-            )
+        ahead = 0 if self.report is None else scan.stamp_ns - max(self.report.stamp_ns, self._heard_ns)
+        self._ahead = self._ahead + 1 if ahead > FAR_AHEAD_NS else 0
+        if self._ahead and self._ahead < CLOCK_SET:
+            log.warning("a scan is stamped %.0f s ahead of all that came: passed over", ahead * 1e-9)
             return None
+        if self._ahead:
+            self.reckoner.restart(scan.stamp_ns)
         if self.report is not None and scan.stamp_ns < self.report.stamp_ns:
             self._old += 1
             if self._old < CLOCK_SET:
                 return self.report.fix if self._old == 1 else None
             self.reckoner.restart(scan.stamp_ns)
-        restarted, self._old = self._old >= CLOCK_SET, 0
+        restarted, self._old = self._old >= CLOCK_SET or self._ahead > 0, 0
         if isinstance(scan, Scan):
             scan = self._seen(scan)
         self.leg = self.reckoner.advance(scan.stamp_ns)
@@ -197,7 +199,7 @@ class GraphMethod:
         ids = self.topo.ids[np.unique(belief.pairs[:, 1])]
         return Report(
             trunks.stamp_ns, belief.state, fix, belief.hypotheses, belief.risk, belief.places, ids, belief.pairs,
-            float(np.sqrt(along)), float(np.sqrt(across)),
+            float(np.sqrt(along)), float(np.sqrt(across)), belief.weights,
         )  # fmt: skip
 
     def _upright(self, leg: Leg, trunks: Trunks) -> Leg:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -39,6 +39,7 @@ class Report:
         hypotheses: how many places are left.
         risk: chance that the best of them is wrong.
         places: (H, 3) x, y, yaw of the robot at the hypotheses, the most probable first.
+        weights: (H,) their probabilities, or empty where the method has none.
         trees: ids of the mapped trees seen.
         pairs: (K, 2) rows of the scan's trunks and of the map's trees.
         along, across: standard deviations of the position along and across the rows (east and north without rows), m.
@@ -54,6 +55,7 @@ class Report:
     pairs: NDArray[np.int64]
     along: float
     across: float
+    weights: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def apart(self) -> float:

@@ -167,7 +167,7 @@ def say_verdict(solved: Any, topo: Any, verdict: Any, folder: Path, target: Path
     trees, others = int(topo.is_tree.sum()), int((~topo.is_tree).sum())
     posts = f"{others} posts, " if others else ""
     click.echo(
-        f"{target}: {trees} trees, {posts}{len(topo.edges)} edges, {where}, {verdict.word}; report: {folder / 'report.html'}"
+        f"{target}: {trees} trees, {posts}{len(topo.edges)} edges, {where}, {verdict.word}; report: {folder / 'report.html'}, to walk through: {folder / 'map.html'}"
     )
 
 
@@ -183,6 +183,7 @@ def save_results(
     from topograph.evaluate import truth_metrics, world_in_map, write_tum
     from topograph.evaluate.metrics import doubles, tree_errors
     from topograph.report.record import write_text
+    from topograph.report.viewer import write_viewer
 
     began = time.perf_counter()
     write_tum(folder / "path.tum", solved.estimate.stamps_ns, solved.estimate.map_T_robot)
@@ -234,6 +235,8 @@ def save_results(
         folder / "report.html", f"Map of {', '.join(p.name for p in bags)}", topo, metrics, figures, solved.run.skipped,
         [*said, *notes], facts, true_trees,
     )  # fmt: skip
+    if len(topo):
+        write_viewer(folder / "map.html", topo, f"Map of {', '.join(p.name for p in bags)}", notes=said[:1])
     progress("map", 1.0)
     return topo, verdict
 

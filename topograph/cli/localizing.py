@@ -54,8 +54,10 @@ def localize(
     from topograph.evaluate import world_in_map, write_tum
     from topograph.evaluate.localization import localization_errors, localization_metrics, path_errors
     from topograph.evaluate.metrics import Metric
+    from topograph.geometry import interpolate
     from topograph.report import localization_error_figure, localization_figure, write_json, write_page
     from topograph.report.record import write_text
+    from topograph.report.viewer import localization_data, write_viewer
 
     if not 0.0 <= from_s < to_s:
         raise UsageError(f"--from {from_s} --to {to_s}: nothing lies between")
@@ -120,10 +122,28 @@ def localize(
             folder / "report.html", f"Localization of {', '.join(p.name for p in bags)}", topo, metrics, figures, run.skipped,
             notes, facts,
         )  # fmt: skip
+        true_xy = None
+        if true is not None and world is not None and len(true.stamps_ns):
+            stamps = np.array([r.stamp_ns for r in run.reports], np.int64)
+            true_xy = world.points(interpolate(true.stamps_ns, true.world_T_robot, stamps)[:, :3, 3])[:, :2]
+        replay = localization_data(folder, topo, true_xy, None if true_xy is None else _off(run.reports, true_xy))
+        write_viewer(
+            folder / "replay.html",
+            topo,
+            f"Localization of {', '.join(p.name for p in bags)}",
+            notes=[said],
+            localization=replay,
+        )
     for note in run.notes:
         click.echo(f"note: {note}", err=True)
     table(metrics)
-    click.echo(f"{said}; report: {folder / 'report.html'}")
+    click.echo(f"{said}; report: {folder / 'report.html'}, to replay: {folder / 'replay.html'}")
+
+
+def _off(reports: Sequence[Any], true_xy: Any) -> Any:
+    """Distances (S,) of the poses from the truth, NaN without a pose, m."""
+    found = np.array([r.fix.map_T_robot[:2, 3] if r.fix is not None else (np.nan, np.nan) for r in reports])
+    return np.hypot(*(found - true_xy).T)
 
 
 MOST_PLACES = 50

@@ -68,7 +68,8 @@ def summary(topo: TopoMap) -> str:
     trees, others = int(topo.is_tree.sum()), int((~topo.is_tree).sum())
     missing = sum(s == "missing" for s in topo.state)
     parts = [f"{trees} trees", f"{others} other landmarks" if others else "", f"{missing} missing" if missing else ""]
-    parts += [f"{len(topo.edges)} edges", f"{len(topo.sessions)} sessions", topo.meta.get("verdict", "")]
+    n = len(topo.sessions)
+    parts += [f"{len(topo.edges)} edges", f"{n} session{'s' if n != 1 else ''}", topo.meta.get("verdict", "")]
     return " · ".join(p for p in parts if p)
 
 

@@ -40,11 +40,6 @@ export function mapLayers(D, ui) {
       id: 'path', data: D.paths.filter((p) => !ui.session || p.session === ui.session), getPath: (p) => p.points,
       getColor: (p) => SESSIONS[(p.session - 1) % SESSIONS.length], getWidth: 2, widthUnits: 'pixels', opacity: 0.7, positionFormat: 'XY', updateTriggers: { data: ui.session },
     }));
-  if (ui.show.ellipses && ui.zoom > ELLIPSE_ZOOM)
-    layers.push(new PathLayer({
-      id: 'ellipses', data: ui.visible.filter((i) => t.a[i] > 0), getPath: (i) => ring(t.x[i], t.y[i], t.a[i] * ui.times, t.b[i] * ui.times, t.turn[i]),
-      _pathType: 'loop', getColor: [...COLORS.tree, 220], getWidth: 1.5, widthUnits: 'pixels', updateTriggers: { getPath: ui.times },
-    }));
   layers.push(new ScatterplotLayer({
     id: 'trees', data: { length: n }, pickable: true, getPosition: (_, { index }) => [t.x[index], t.y[index]], getRadius: (_, { index }) => 0.5 * (t.d[index] || 0.2),
     radiusUnits: 'common', radiusMinPixels: n > 20000 ? 1.5 : 4, radiusMaxPixels: 60, stroked: n < 20000, lineWidthUnits: 'pixels', getLineWidth: 1.5,
@@ -52,6 +47,11 @@ export function mapLayers(D, ui) {
     getLineColor: (_, { index }) => (seen(index) ? COLORS[look(t, index)] : [0, 0, 0, 0]), autoHighlight: true, highlightColor: [255, 200, 0, 160],
     updateTriggers: { getFillColor: ui.session, getLineColor: ui.session },
   }));
+  if (ui.show.ellipses && ui.zoom > ELLIPSE_ZOOM)
+    layers.push(new PathLayer({
+      id: 'ellipses', data: ui.visible.filter((i) => t.a[i] > 0), getPath: (i) => ring(t.x[i], t.y[i], t.a[i] * ui.times, t.b[i] * ui.times, t.turn[i]),
+      _pathType: 'loop', getColor: [...COLORS.tree, 220], getWidth: 1.5, widthUnits: 'pixels', updateTriggers: { getPath: ui.times },
+    }));
   if (ui.selected >= 0) layers.push(...selectedLayers(D, ui.selected));
   if (ui.show.labels && ui.zoom > LABEL_ZOOM)
     layers.push(new TextLayer({

@@ -20,16 +20,31 @@ const fit = () => {
 let viewState = fit();
 
 const deck = new Deck({
-  parent: stage, width: '100%', height: '100%', views: new OrthographicView({ flipY: false }), viewState, controller: { keyboard: true, dragRotate: false },
+  parent: stage, width: '100%', height: '100%', views: new OrthographicView({ flipY: false }), viewState, controller: { keyboard: true, dragRotate: false, doubleClickZoom: false },
   getCursor: ({ isHovering, isDragging }) => (isDragging ? 'grabbing' : isHovering ? 'pointer' : 'grab'), pickingRadius: 12,
   onViewStateChange: (e) => { viewState = e.viewState; deck.setProps({ viewState }); later(); },
-  onClick: (info) => select(info.layer && info.layer.id === 'trees' ? info.index : -1),
   getTooltip: ({ layer, index }) => (layer && layer.id === 'trees' && index >= 0 ? { text: title(index), className: 'tip' } : null),
-  onAfterRender: () => { if (!document.body.dataset.drawn) { document.body.dataset.drawn = (performance.now() - began).toFixed(0); } },
+  onLoad: () => { ui.ready = true; },
+  onAfterRender: () => {
+    if (document.body.dataset.drawn || !ui.ready || !deck.props.layers.length || !deck.layerManager.getLayers().every((l) => l.isLoaded)) return;
+    document.body.dataset.drawn = (performance.now() - began).toFixed(0);
+  },
   onError: (e) => { document.body.dataset.error = String(e && e.message); },
 });
 stage.querySelector('canvas')?.setAttribute('tabindex', '0');
 stage.querySelector('canvas')?.setAttribute('aria-label', 'Map of the trees; arrow keys move, plus and minus zoom, click a tree for its facts');
+
+// A click is a press that did not move, however long a slow machine took over it.
+let pressed = null;
+stage.addEventListener('pointerdown', (e) => { pressed = { x: e.clientX, y: e.clientY, id: e.pointerId }; }, true);
+stage.addEventListener('pointerup', (e) => {
+  const p = pressed;
+  pressed = null;
+  if (!p || p.id !== e.pointerId || Math.hypot(e.clientX - p.x, e.clientY - p.y) > 6) return;
+  const r = stage.getBoundingClientRect();
+  const hit = deck.pickObject({ x: e.clientX - r.left, y: e.clientY - r.top, radius: 12, layerIds: ['trees'] });
+  select(hit ? hit.index : -1);
+}, true);
 
 let timer = 0;
 const later = () => { scale(); clearTimeout(timer); timer = setTimeout(draw, 60); };
@@ -160,7 +175,7 @@ if (L) {
 }
 addEventListener('keydown', (e) => {
   if (e.key === 'Escape') select(-1);
-  if (e.key === '/' && e.target.tagName !== 'INPUT') { e.preventDefault(); $('search').focus(); }
+  if (e.key === '/' && e.target.type !== 'search') { e.preventDefault(); $('search').focus(); }
 });
 addEventListener('resize', later);
 window.topograph = { D, ui, select, goTo, state: () => viewState, project: (i) => deck.getViewports()[0].project([t.x[i], t.y[i]]) };

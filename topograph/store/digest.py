@@ -12,13 +12,13 @@ DIGESTED = ("trees", "edges", "path", "viewpoints", "sessions", "sightings", "me
 
 
 def digest(c: sqlite3.Connection, table: str) -> str:
-    """SHA-256 over the rows of a table; of `meta` without the digests themselves."""
+    """SHA-256 over the rows of a table (not of an index, which may say otherwise); of `meta` without the digests themselves."""
     where = " WHERE key NOT LIKE 'digest:%' ORDER BY key" if table == "meta" else " ORDER BY id"
     columns = "key, value" if table == "meta" else "*"
     if table == "viewpoints":  # clouds have a CRC each
         columns = "id, tree, vx, vy, vz, points, crc" + (", session" if has(c, table, "session") else "")
     h = hashlib.sha256()
-    for row in c.execute(f"SELECT {columns} FROM {table}{where}"):  # the names are those above
+    for row in c.execute(f"SELECT {columns} FROM {table} NOT INDEXED{where}"):  # the names are those above
         h.update(repr(row).encode())
     return h.hexdigest()
 
@@ -30,15 +30,17 @@ def has(c: sqlite3.Connection, table: str, column: str) -> bool:
 
 def check_digests(c: sqlite3.Connection, path: Path) -> None:
     """Maps of older programs, which knew no sessions, have none."""
-    there = {k.removeprefix("digest:") for (k,) in c.execute("SELECT key FROM meta WHERE key LIKE 'digest:%'")}
-    (version,) = c.execute("SELECT value FROM meta WHERE key='schema_version'").fetchone()
+    there = {
+        k.removeprefix("digest:") for (k,) in c.execute("SELECT key FROM meta NOT INDEXED WHERE key LIKE 'digest:%'")
+    }
+    (version,) = c.execute("SELECT value FROM meta NOT INDEXED WHERE key='schema_version'").fetchone()
     with_digests = int(version) >= 2 and has(c, "sessions", "id")
     if missing := (set(DIGESTED) - there if with_digests else set()):
         raise MapError(
             f"{path}: the digest of table {min(missing)!r} is gone: the file was edited elsewhere; restore a copy, or take over what it says "
             f"with `topograph repair {path.name} NEW.gpkg`"
         )
-    for key, value in c.execute("SELECT key, value FROM meta WHERE key LIKE 'digest:%'").fetchall():
+    for key, value in c.execute("SELECT key, value FROM meta NOT INDEXED WHERE key LIKE 'digest:%'").fetchall():
         table = key.removeprefix("digest:")
         if table in DIGESTED and digest(c, table) != value:
             raise MapError(

@@ -35,7 +35,7 @@ def opened(path: Path) -> Iterator[sqlite3.Connection]:
         ).fetchall()
         if foreign:
             raise MapError(f"{path}: holds a view or a trigger ({foreign[0][0]}), which no map does: it is not read")
-        row = c.execute("SELECT value FROM meta WHERE key='schema_version'").fetchone()
+        row = c.execute("SELECT value FROM meta NOT INDEXED WHERE key='schema_version'").fetchone()
         if row is None:
             raise MapError(f"{path}: a GeoPackage, but not a topograph map (no schema version)")
         if not int(row[0]) >= 1:
@@ -61,7 +61,7 @@ def load(path: Path | str, *, clouds: bool = True, check: bool = True) -> TopoMa
     with opened(path) as c:
         if check:
             check_digests(c, path)
-        meta = dict(c.execute("SELECT key, value FROM meta"))
+        meta = dict(c.execute("SELECT key, value FROM meta NOT INDEXED"))
         newer = ", kind, kind_probability, stems" if int(meta["schema_version"]) >= 2 else ", 'tree', NULL, 1"
         rows = c.execute(
             "SELECT id, x, y, z, cov_xx, cov_xy, cov_yy, cov_zz, axis_x, axis_y, axis_z, diameter, first_branch, "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import time
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from topograph.errors import InputError, UsageError
 
 
 @main.command()
-@click.argument("runs", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("runs", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--truth", "truths", multiple=True, metavar="TRUTH",
               help="A simulator's folder, a .tum path, trees as .csv or .geojson, or `fixes` (each run's own GNSS, filtered, as the thesis had "
                    "it). Once for all runs, or once for each, in order; A+B lays two together.")  # fmt: skip
@@ -36,12 +37,32 @@ from topograph.errors import InputError, UsageError
 @click.option("--ablations", is_flag=True, help="Also leave each part out in turn.")
 @click.option("--rival", "rivals", multiple=True, type=click.Path(path_type=Path),
               help="A Python file with `method(topo, config)`, a localizer with `step(trunks, leg) -> Report`; it joins table B.")  # fmt: skip
+@click.option(
+    "--suite",
+    is_flag=True,
+    help="Instead of RUNS, simulated ones: designs x seeds x GNSS x driving. Goes on where it was stopped (give --results).",
+)
+@click.option("--designs", default="grid,olive,steep", show_default=True, help="Of --suite.")
+@click.option("--seeds", default="3001-3003", show_default=True, help="Of --suite: FIRST-LAST.")
+@click.option("--gnss", default="rtk", show_default=True, help="Of --suite: rtk, float, none; several with commas.")
+@click.option(
+    "--driving", default="driving", show_default=True, help="Of --suite: driving, stops; several with commas."
+)
+@click.option(
+    "--longest", type=click.FloatRange(10.0), default=75.0, show_default=True, help="Of --suite: seconds of a run."
+)
+@click.option(
+    "--detections", is_flag=True, help="Of --suite: trunk detections in place of clouds (fast; one front end)."
+)
+@click.option(
+    "--jobs", type=click.IntRange(1), default=os.cpu_count() or 1, show_default=True, help="Of --suite: processes."
+)
 @click.option("--results", type=click.Path(path_type=Path), help="Folder for page, figures and metrics.json.")
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 @input_options
 def compare(
-    runs: tuple[Path, ...], truths: tuple[str, ...], starts: int, ablations: bool, rivals: tuple[Path, ...], results: Path | None,
-    quiet: bool, config_file: Path | None, **words: Any,
+    runs: tuple[Path, ...], truths: tuple[str, ...], starts: int, ablations: bool, rivals: tuple[Path, ...], suite: bool,
+    designs: str, seeds: str, gnss: str, driving: str, longest: float, detections: bool, jobs: int, results: Path | None, quiet: bool, config_file: Path | None, **words: Any,
 ) -> None:  # fmt: skip
     """Both methods on RUNS: map the first, localize all. Chapter 5's tables and figures, three questions, one page.
 
@@ -52,13 +73,18 @@ def compare(
     from topograph.report.comparison import records, write_comparison
     from topograph.report.record import write_text
 
+    if suite == bool(runs):
+        raise UsageError("give recordings to compare on, or --suite")
+    config = config_of(config_file, words)
+    if suite:
+        _suite(config, (designs, seeds, gnss, driving), longest, detections, starts, jobs, results, quiet)
+        return
     for p in runs:
         if not p.exists():
             raise InputError(f"{p}: no such recording")
     by_fixes = truths == ("fixes",)
     true = [None] * len(runs) if by_fixes else _truths(truths, len(runs))
     methods = {p.stem: _method_of(p) for p in rivals}
-    config = config_of(config_file, words)
     say_if_cold(quiet)
     began = time.perf_counter()
     with results_folder(results) as folder, hashed(runs) as hashes:
@@ -74,6 +100,53 @@ def compare(
             (folder / f"{_slug(caption)}.png").write_bytes(png)
         write_text(folder / "config.yaml", dump(config))
         record = {"metrics": records(c), "notes": c.notes, "inputs": hashes(), "versions": versions()}
+        write_text(folder / "metrics.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
+    _say(c)
+    click.echo(f"{time.perf_counter() - began:.0f} s; page: {folder / 'report.html'}")
+
+
+def _suite(
+    config: Any, words: tuple[str, str, str, str], longest: float, detections: bool, starts: int, workers: int, results: Path | None, quiet: bool
+) -> None:  # fmt: skip
+    from itertools import product
+
+    from topograph.pipeline.suite import Job, run_suite
+    from topograph.report.comparison import records, write_comparison
+    from topograph.report.record import write_text
+    from topograph.simulate import DESIGNS
+
+    designs, seeds, gnss, driving = words
+    for word, known in (
+        (designs, tuple(DESIGNS)),
+        (gnss, ("rtk", "float", "degraded", "none")),
+        (driving, ("driving", "stops")),
+    ):
+        for w in word.split(","):
+            if w not in known:
+                raise UsageError(f"{w}: known are {', '.join(known)}")
+    first, _, last = seeds.partition("-")
+    if not first.isdigit() or not (last or first).isdigit():
+        raise UsageError(f"--seeds {seeds}: give FIRST-LAST")
+    jobs = [
+        Job(d, s, g, w, longest, 3, starts, detections)
+        for d, s, g, w in product(
+            designs.split(","), range(int(first), int(last or first) + 1), gnss.split(","), driving.split(",")
+        )
+    ]
+    began = time.perf_counter()
+    with results_folder(results) as folder:
+        with progress_bar(quiet) as progress:
+            c = run_suite(jobs, folder / "jobs", config, workers, progress)
+        facts = {
+            "orchards": str(len(jobs)),
+            "designs": designs,
+            "seeds": seeds,
+            "GNSS": gnss,
+            "driving": driving,
+            "topograph": __version__,
+        }
+        write_comparison(folder / "report.html", c, facts)
+        record = {"metrics": records(c), "notes": c.notes, "versions": versions()}
         write_text(folder / "metrics.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
     _say(c)
     click.echo(f"{time.perf_counter() - began:.0f} s; page: {folder / 'report.html'}")
@@ -115,7 +188,7 @@ def _say(c: Any) -> None:
     from topograph.report.comparison import tables
 
     for t in tables(c):
-        if not t.title.startswith(("A:", "B:", "C:", "Conv")):
+        if not t.title.startswith(("A:", "B:", "C:", "Conv", "Ours")):
             continue
         click.echo(f"\n{t.title}")
         wide = max(len(r.name) for r in t.rows)
@@ -143,5 +216,8 @@ SHORT = {
     "convergence max": "max",
     "starts that ended wrong": "wrong",
     "starts without an end": "no end",
+    "ratio": "ratio",
+    "95 % from": "95 % from",
+    "95 % to": "to",
 }
 """Columns that a terminal has room for."""

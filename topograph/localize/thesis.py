@@ -129,8 +129,9 @@ class ThesisMethod:
             self._by_icp(c, p, n) for c, p, n in zip(clouds, trunks.p[use], self._by_distance(z), strict=True)
         ]
         found = self._combine(z, candidates)
-        poses = np.array([multilaterate(z, self.nodes[list(c)]) for c in found]).reshape(-1, 3)
-        return Measured(poses, found)
+        if not found:
+            return NOTHING
+        return Measured(multilaterate_all(z, self.nodes[np.array(found)]), found)
 
     def _report(self, stamp_ns: int, leg: Leg) -> Report:
         places = self.poses[_distinct(self.poses, TOGETHER)]
@@ -274,22 +275,31 @@ def _turned(angle: float) -> float:
 
 
 def multilaterate(z: Array, beacons: Array, steps: int = 100) -> Array:
-    """Pose (3,) from ranges to beacons (N, 2), by gradient descent on the squared range errors (thesis 3.4).
+    """Pose (3,) from ranges to beacons (N, 2); see `multilaterate_all`."""
+    return np.asarray(multilaterate_all(z, beacons[None], steps)[0])
+
+
+def multilaterate_all(z: Array, beacons: Array, steps: int = 100) -> Array:
+    """Poses (C, 3) from ranges to beacons (C, N, 2), by gradient descent on the squared range errors (thesis 3.4).
 
     `z` (N, 2) are the trunks in the robot's frame, m. The start is the rigid fit's position, which resolves the mirror image
     of two ranges; the heading is the mean turn between bearings in the robot's frame and in the map.
     """
-    a, b = z - z.mean(0), beacons - beacons.mean(0)
-    yaw = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
+    a, b = z - z.mean(0), beacons - beacons.mean(1, keepdims=True)
+    yaw = np.arctan2(np.sum(a[:, 0] * b[..., 1] - a[:, 1] * b[..., 0], axis=1), np.sum(a * b, axis=(1, 2)))
     c, s = np.cos(yaw), np.sin(yaw)
-    x = beacons.mean(0) - np.array([[c, -s], [s, c]]) @ z.mean(0)
+    mx, my = z.mean(0)
+    x = beacons.mean(1) - np.stack([c * mx - s * my, s * mx + c * my], axis=1)
     ranges = np.hypot(z[:, 0], z[:, 1])
+    going = np.arange(len(x))
     for _ in range(steps):
-        away = x - beacons
-        d = np.maximum(np.linalg.norm(away, axis=1), 1e-6)
-        gradient = ((d - ranges) / d) @ away
-        x = x - 0.5 / len(z) * gradient
-        if np.abs(gradient).max() < 1e-5:
+        away = x[going, None] - beacons[going]
+        d = np.maximum(np.linalg.norm(away, axis=2), 1e-6)
+        gradient = np.sum(((d - ranges) / d)[..., None] * away, axis=1)
+        x[going] -= 0.5 / len(z) * gradient
+        going = going[np.abs(gradient).max(axis=1) >= 1e-5]
+        if not len(going):
             break
-    seen = np.arctan2(*(beacons - x).T[::-1]) - np.arctan2(z[:, 1], z[:, 0])
-    return np.array([x[0], x[1], np.arctan2(np.sin(seen).sum(), np.cos(seen).sum())])
+    seen = beacons - x[:, None]
+    turn = np.arctan2(seen[..., 1], seen[..., 0]) - np.arctan2(z[:, 1], z[:, 0])
+    return np.column_stack([x, np.arctan2(np.sin(turn).sum(axis=1), np.cos(turn).sum(axis=1))])

@@ -82,7 +82,7 @@ BREAKS = [
     Break("pose covariance: x and y swapped", T + "localize/localizer.py", "cov[np.ix_([3, 4, 2], [3, 4, 2])] = belief.cov", "cov[np.ix_([4, 3, 2], [4, 3, 2])] = belief.cov", NUMBERS + " -k 'unsure'"),
     Break("pose covariance a hundredth", T + "localize/localizer.py", "cov[np.ix_([3, 4, 2], [3, 4, 2])] = belief.cov", "cov[np.ix_([3, 4, 2], [3, 4, 2])] = 0.01 * belief.cov", NUMBERS + " -k 'sure'"),
     Break("smoother returns its input", T + "localize/smooth.py", "result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()", "result = values", NUMBERS + " -k 'as_sure'"),
-    Break("GeoJSON: latitude and longitude swapped", T + "report/export.py", '"coordinates": [float(g[i, 1]), float(g[i, 0])', '"coordinates": [float(g[i, 0]), float(g[i, 1])', NUMBERS + " -k 'exports'"),
+    Break("GeoJSON: latitude and longitude swapped", T + "exchange/tables.py", '[c["lon"][i], c["lat"][i], c["h"][i]]', '[c["lat"][i], c["lon"][i], c["h"][i]]', P + "test_exchange.py"),
     Break("radians printed as degrees", T + "report/page.py", 'return f"{np.degrees(v):.2f}°"', 'return f"{v:.2f}°"', NUMBERS + " -k 'shown'"),
     Break("recall always 1", T + "evaluate/metrics.py", "float(seen[j].sum() / max(seen.sum(), 1))", "1.0", NUMBERS + " -k 'metrics_tell'"),
     Break("NEES of the wrong axis", T + "evaluate/metrics.py", 'np.einsum("ni,nij,nj->n", e[:, :2], np.linalg.inv(c), e[:, :2])', 'np.einsum("ni,nij,nj->n", e[:, :2], np.linalg.inv(c), 0 * e[:, :2])', NUMBERS + " -k 'metrics_tell'"),

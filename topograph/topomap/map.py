@@ -28,7 +28,7 @@ class Viewpoint:
     session: int = 0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, repr=False, kw_only=True)
 class TopoMap:
     """Nodes, edges and the path that saw them, in the `map` frame (ENU at `datum`, or local when that is None).
 
@@ -72,6 +72,13 @@ class TopoMap:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def __repr__(self) -> str:
+        where = "local" if self.datum is None else f"at {self.datum.lat:.5f}, {self.datum.lon:.5f}"
+        return (
+            f"<TopoMap {where}: {int(self.is_tree.sum())} trees, {int((~self.is_tree).sum())} other landmarks, {len(self.edges)} edges, "
+            f"{len(self.viewpoints)} viewpoints, {len(self.sessions)} sessions>"
+        )
 
     @staticmethod
     def of_points(xy: Array, sigma: float = 0.01) -> TopoMap:

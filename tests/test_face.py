@@ -44,8 +44,9 @@ def test_the_example_of_a_detector_of_ones_own(tmp_path: Path, detections_run: t
     path, truth = detections_run
     topograph.save_map(topograph.map_bags(path), tmp_path / "m.gpkg")
     topo = topograph.load_map(tmp_path / "m.gpkg")
-    node, off = Node(str(tmp_path / "m.gpkg")), []
+    off = []
     with Recording([path]) as r:
+        node = Node(str(tmp_path / "m.gpkg"), r.frames.find("imu_link")[:3, :3])
         for _, m in r.messages():
             if isinstance(m, Odometry):
                 node.odometry(m.stamp_ns, m.odom_T_child, m.twist)

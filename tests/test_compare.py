@@ -322,3 +322,11 @@ def test_a_suite_goes_on_where_it_was_stopped(tmp_path: Path) -> None:
     assert job.stat().st_mtime_ns == stamp  # not done again
     assert json.loads((tmp_path / "metrics.json").read_text())["metrics"] == json.loads(first)["metrics"]
     assert call("compare").exit_code == 2
+
+
+def test_the_readmes_figures_are_those_that_were_measured() -> None:
+    import subprocess
+    import sys
+
+    tool = Path(__file__).resolve().parents[1] / "tools" / "readme_figures.py"
+    assert subprocess.run([sys.executable, tool, "--check"]).returncode == 0

@@ -208,7 +208,7 @@ def test_failed_commands_leave_no_folders(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_committed_configuration_is_the_default() -> None:
     text = (Path(__file__).resolve().parents[1] / "configs" / "default.yaml").read_text()
-    assert text == dump(Config()), "run: topograph config > configs/default.yaml"
+    assert text == dump(Config()), "run: topograph config --bare > configs/default.yaml"
 
 
 def test_configuration_round_trip_and_refusals(tmp_path: Path) -> None:

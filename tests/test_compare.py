@@ -178,7 +178,11 @@ def test_pairs_take_the_orchards_difficulty_out() -> None:
 
 def test_presets_are_names_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert "halving" in call("config", "-c", "thesis").output
+    explained = call("config", "-c", "thesis").output
+    assert "rule: halving" in explained
+    assert "# " in explained
+    (tmp_path / "x.yaml").write_text(explained)
+    assert call("config", "-c", tmp_path / "x.yaml", "--bare").output == call("config", "-c", "thesis", "--bare").output
     written, best = over(Config(), "thesis"), over(Config(), "thesis_best")
     assert not written.thesis.reset
     assert best.thesis.reset

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import yaml
@@ -144,6 +145,35 @@ def _consistent(config: Config) -> None:
 def dump(config: Config) -> str:
     """The whole configuration as YAML, defaults included."""
     return yaml.safe_dump(_plain(asdict(config)), sort_keys=False, default_flow_style=None, width=110)
+
+
+def explained(config: Config) -> str:
+    """`dump` with what each setting means, and its unit, as comments: what the settings' own docstrings say."""
+    lines: list[str] = []
+    for room, block in _plain(asdict(config)).items():
+        says = _attributes(getattr(config, room).__doc__ or "")
+        lines.append(f"{room}:")
+        for key, value in block.items():
+            if key in says:
+                lines += [f"  # {line}" for line in wrap(says[key], 110)]
+            text = yaml.safe_dump(value, default_flow_style=True, width=10**6).removesuffix("...\n").strip()
+            lines.append(f"  {key}: {text}")
+    return "\n".join(lines) + "\n"
+
+
+def _attributes(doc: str) -> dict[str, str]:
+    """Name -> text of a docstring's `Attributes:`; a line may name several."""
+    out: dict[str, str] = {}
+    names: list[str] = []
+    for line in doc.partition("Attributes:")[2].splitlines():
+        head, colon, text = line.strip().partition(":")
+        words = [w.strip(" `") for w in head.split(",")]
+        if colon and all(w.isidentifier() for w in words):
+            names = words
+            out |= dict.fromkeys(names, text.strip())
+        elif names and line.strip():
+            out |= {n: f"{out[n]} {line.strip()}" for n in names}
+    return out
 
 
 def _plain(value: Any) -> Any:

@@ -495,10 +495,11 @@ def export(map_file: Path, output: Path) -> None:
     "--config",
     "config_file",
     type=click.Path(path_type=Path),
-    help="Check this file and fill in the rest.",
+    help="Check this file (or `thesis`, `thesis_best`) and fill in the rest.",
 )
-def config_command(config_file: Path | None) -> None:
-    """Print the whole configuration as YAML."""
-    from topograph.config import dump, load
+@click.option("--bare", is_flag=True, help="Without what the settings mean.")
+def config_command(config_file: Path | None, bare: bool) -> None:
+    """Print the whole configuration as YAML, each setting with its meaning and unit."""
+    from topograph.config import dump, explained, load
 
-    click.echo(dump(load(config_file)), nl=False)
+    click.echo((dump if bare else explained)(load(config_file)), nl=False)

@@ -93,9 +93,8 @@ def main(verbose: bool) -> None:
     _one_arena()
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _end)
-    logging.basicConfig(level=logging.DEBUG if verbose else logging.ERROR, format="%(name)s: %(message)s")
-    if not verbose:
-        logging.getLogger("topograph").setLevel(logging.WARNING)
+    logging.basicConfig(level=logging.WARNING if verbose else logging.ERROR, format="%(name)s: %(message)s")
+    logging.getLogger("topograph").setLevel(logging.DEBUG if verbose else logging.WARNING)
 
 
 def check_accepted(accept: Sequence[str]) -> None:

@@ -138,6 +138,8 @@ def localize(
         click.echo(f"note: {note}", err=True)
     table(metrics)
     click.echo(f"{said}; report: {folder / 'report.html'}, to replay: {folder / 'replay.html'}")
+    if not fixes:
+        raise SystemExit(4)
 
 
 def _off(reports: Sequence[Any], true_xy: Any) -> Any:

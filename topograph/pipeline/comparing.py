@@ -324,6 +324,10 @@ def _world(w: _Work, map_name: str, truth: Truth) -> WorldInMap:
     return world_in_map(w.out.maps[map_name], truth)
 
 
+PATIENCE = 120.0
+"""Metres after which a start counts as one without an end: ten times what the thesis's worst start took."""
+
+
 # -- convergence ------------------------------------------------------------------------------------------------------
 
 
@@ -347,7 +351,9 @@ def _starts(w: _Work, configs: dict[str, Config], n: int, progress: Progress) ->
         found = []
         for k, scan in enumerate(np.linspace(0, 0.8 * scans, n).astype(int).tolist()):
             progress("starts", (c * n + k) / (len(chains) * n))
-            r = localize_heard(out.maps[map_name], heard, config, method, first=scan, until_committed=True)
+            r = localize_heard(
+                out.maps[map_name], heard, config, method, first=scan, until_committed=True, most=PATIENCE
+            )
             found.append(start_of(scan, r.reports, r.distance, r.trunks_seen, truth, world))
         out.starts[name] = found
         out.rows.append(Row("convergence", name, run, start_metrics(found)))

@@ -88,11 +88,18 @@ def localize_bags(
 
 
 def localize_heard(
-    topo: TopoMap, heard: Heard, config: Config, method: MethodOf, *, first: int = 0, until_committed: bool = False
+    topo: TopoMap,
+    heard: Heard,
+    config: Config,
+    method: MethodOf,
+    *,
+    first: int = 0,
+    until_committed: bool = False,
+    most: float = float("inf"),
 ) -> Replay:
     """The same from what was read before: a run is detected once, and localized in many maps by many methods.
 
-    It begins with the scan number `first`; `until_committed`: it ends with the first pose.
+    It begins with the scan number `first`; `until_committed`: it ends with the first pose, or after `most` m.
     """
     out = Replay(duration_s=heard.session.duration_s, chosen=dict(heard.session.chosen))
     imu = heard.session.mounts.get("imu")
@@ -115,7 +122,7 @@ def localize_heard(
             player.take(earlier)
         before = []
         player.take(m)
-        if until_committed and out.reports and out.reports[-1].fix is not None:
+        if until_committed and out.reports and (out.reports[-1].fix is not None or out.distance[-1] > most):
             return out
     player.finish(silent)
     return out

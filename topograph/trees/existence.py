@@ -30,6 +30,8 @@ RARE = 2.5
 """Log-odds that a tree seen once would need beyond that; the demand falls with the root of the sightings."""
 BLOCK = 100_000
 """Pairs of scans and trees that are looked at together."""
+BESIDE, HARDLY = 1.2, 0.12
+"""m, and share of the neighbour's sightings (real neighbours in trellises and hedgerows at 1.0 to 1.8 m: 0.39 and more)."""
 REACH = 31.0
 """Beyond this no scan records what it saw through, m."""
 
@@ -96,7 +98,22 @@ def exists(
         if np.isfinite(d.kinds).any():  # ours are log-odds; of what other sources call a score nobody knows the scale
             demand += RARE / np.sqrt(np.maximum(hits, 1)) - DOUBTFUL
         ok &= (kind != TREE) | (score >= demand)
+        ok &= ~_hangers_on(places, hits, ok & (kind == TREE))
     return Existence(ok=ok & (kind != OTHER), kind=kind, probability=probability, score=score, hits=hits, passed=passed)
+
+
+def _hangers_on(places: Array, hits: NDArray[np.int64], trees: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(T,) of those that pass for trees, what is seen hardly ever close beside a tree that always is: a sucker, a low branch. Of two trees that
+    stand so close neither hides the other for nearly all of a run."""
+    rows = np.flatnonzero(trees)
+    out = np.zeros(len(places), bool)
+    if len(rows) < 2:
+        return out
+    pairs = cKDTree(places[rows, :2]).query_pairs(BESIDE, output_type="ndarray").reshape(-1, 2)
+    a, b = rows[pairs[:, 0]], rows[pairs[:, 1]]
+    out[a[hits[a] < HARDLY * hits[b]]] = True
+    out[b[hits[b] < HARDLY * hits[a]]] = True
+    return out
 
 
 def seen_through(detections: Detections, map_T_scan: Array, places: Array) -> NDArray[np.int64]:

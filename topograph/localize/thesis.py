@@ -188,26 +188,29 @@ class ThesisMethod:
     def _combine(self, z: Array, candidates: list[NDArray[np.int64]]) -> list[tuple[int, ...]]:
         """Combinations whose distances agree with the map's (Table 4.1); none when there are too many."""
         d = np.linalg.norm(z[:, None] - z[None], axis=2)
-        found: list[tuple[int, ...]] = [()]
+        parts = np.zeros((1, 0), np.int64)
         for i, nodes in enumerate(candidates):
-            longer = []
-            for part in found:
-                for t in nodes.tolist():
-                    if t in part:
-                        continue
-                    if part:
-                        there = np.linalg.norm(self.nodes[list(part)] - self.nodes[t], axis=1)
-                        if (np.abs(there - d[i, : len(part)]) > self.config.consistency).any():
-                            continue
-                    longer.append((*part, t))
-                    if len(longer) > 20 * self.config.combinations:
-                        self.exploded += 1
-                        return []
-            found = longer
-        if len(found) > self.config.combinations:
+            longer: list[NDArray[np.int64]] = []
+            total = 0
+            block = max(1, PAIRS_AT_ONCE // max(len(nodes), 1))
+            for k in range(0, len(parts), block):
+                some = parts[k : k + block]
+                ok = np.ones((len(some), len(nodes)), bool)
+                for q in range(some.shape[1]):
+                    there = np.linalg.norm(self.nodes[some[:, q], None] - self.nodes[None, nodes], axis=2)
+                    ok &= np.abs(there - d[i, q]) <= self.config.consistency
+                    ok &= some[:, q, None] != nodes[None]
+                rows, columns = np.nonzero(ok)
+                longer.append(np.column_stack([some[rows], nodes[columns]]))
+                total += len(rows)
+                if total > 20 * self.config.combinations:
+                    self.exploded += 1
+                    return []
+            parts = np.concatenate(longer) if longer else np.zeros((0, i + 1), np.int64)
+        if len(parts) > self.config.combinations:
             self.exploded += 1
             return []
-        return found
+        return [tuple(row) for row in parts.tolist()]
 
     def _update(self, measured: Measured, leg: Leg, driven: float) -> None:
         """Algorithm 6, `driven` metres after the last iteration."""
@@ -246,6 +249,8 @@ class ThesisMethod:
         self.poses, self.counts, self.by = self.poses[keep], self.counts[keep], [self.by[k] for k in keep]
 
 
+PAIRS_AT_ONCE = 1_000_000
+"""Parts of combinations times candidate nodes that are looked at together."""
 TOGETHER = 0.3
 """Poses nearer than this to each other are one place: the hypotheses have converged, whether or not they are counted as one, m."""
 

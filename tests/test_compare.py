@@ -334,3 +334,43 @@ def test_the_readmes_figures_are_those_that_were_measured() -> None:
 
     tool = Path(__file__).resolve().parents[1] / "tools" / "readme_figures.py"
     assert subprocess.run([sys.executable, tool, "--check"]).returncode == 0
+
+
+def test_a_later_run_is_judged_in_the_frame_of_the_mapped_one(tmp_path: Path) -> None:
+    """Without GNSS, and with stamps that overlap: run 2 was once laid onto run 1's path, and 3 cm came out as 12 m."""
+    from topograph.simulate import DriveConfig, SensorConfig, record
+
+    for k in (1, 2):
+        record(
+            tmp_path / f"n{k}.bag",
+            21,
+            "grid",
+            DriveConfig(run=k, longest_s=25.0),
+            SensorConfig(gnss="none", detections=True),
+        )
+    words = [str(tmp_path / f"n{k}.bag") for k in (1, 2)]
+    truths = [w for k in (1, 2) for w in ("--truth", str(tmp_path / f"n{k}.truth"))]
+    out = call("compare", *words, *truths, "--starts", 0, "--results", tmp_path / "r", "-q")
+    assert out.exit_code == 0, out.output
+    assert "laid onto the map by its path" in out.output
+    found = {m["key"]: m["value"] for m in json.loads((tmp_path / "r" / "metrics.json").read_text())["metrics"]}
+    assert found["C/graph/distance error mean"] < 0.3
+    (tmp_path / "far.csv").write_text("\ufefflat,lon\n10.0,10.0\n10.0001,10.0\n10.0,10.0001\n")
+    out = call("compare", words[0], "--truth", tmp_path / "far.csv", "--starts", 0, "--results", tmp_path / "f", "-q")
+    assert "unexpected" not in out.output
+    assert out.exit_code in (0, 3), out.output
+
+
+def test_exports_and_pages_do_not_overwrite(tmp_path: Path) -> None:
+    from test_store import make
+
+    from topograph import store
+
+    store.save(make(5), tmp_path / "m.gpkg")
+    for name in ("rec.bag", "x.csv", "page.html"):
+        (tmp_path / name).write_text("mine")
+        command = "view" if name.endswith("html") else "export"
+        assert call(command, tmp_path / "m.gpkg", tmp_path / name).exit_code == 2
+        assert (tmp_path / name).read_text() == "mine"
+        assert call(command, tmp_path / "m.gpkg", tmp_path / name, "--force").exit_code == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["m.gpkg", "page.html", "rec.bag", "x.csv"]

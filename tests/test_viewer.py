@@ -194,4 +194,4 @@ def test_the_command(tmp_path: Path) -> None:
     store.save(make(4), tmp_path / "m.gpkg")
     assert call("view", tmp_path / "m.gpkg", tmp_path / "m.html").exit_code == 0
     assert call("view", tmp_path / "m.gpkg", tmp_path / "m.html", "--serve").exit_code == 2
-    assert call("view", tmp_path / "m.gpkg", tmp_path / "m.html", "--localization", tmp_path).exit_code == 3
+    assert call("view", tmp_path / "m.gpkg", tmp_path / "n.html", "--localization", tmp_path).exit_code == 3

@@ -466,7 +466,8 @@ def repair(map_file: Path, output: Path) -> None:
 @main.command()
 @click.argument("map_file", type=click.Path(path_type=Path))
 @click.argument("output", type=click.Path(path_type=Path))
-def export(map_file: Path, output: Path) -> None:
+@click.option("--force", is_flag=True, help="Replace OUTPUT if it is there.")
+def export(map_file: Path, output: Path, force: bool) -> None:
     """Write MAP_FILE in the format that OUTPUT's suffix names.
 
     \b
@@ -483,6 +484,8 @@ def export(map_file: Path, output: Path) -> None:
         raise UsageError(f"{output}: is an input; nothing is written over it")
     if output.suffix not in WRITERS:
         raise UsageError(f"{output}: end the name in one of {', '.join(WRITERS)}")
+    if output.exists() and not force:
+        raise UsageError(f"{output}: is there already; --force replaces it")
     if not output.parent.is_dir():
         raise UsageError(f"{output}: there is no folder {output.parent}")
     write(store.load(map_file, clouds=WRITERS[output.suffix][2]), output)

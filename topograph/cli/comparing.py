@@ -76,6 +76,8 @@ def compare(
     if suite == bool(runs):
         raise UsageError("give recordings to compare on, or --suite")
     config = config_of(config_file, words)
+    if suite and (truths or rivals or ablations):
+        raise UsageError("--suite simulates its own truth, and takes neither --truth nor --rival nor --ablations")
     if suite:
         _suite(config, (designs, seeds, gnss, driving), longest, detections, starts, jobs, results, quiet)
         return
@@ -84,7 +86,9 @@ def compare(
             raise InputError(f"{p}: no such recording")
     by_fixes = truths == ("fixes",)
     true = [None] * len(runs) if by_fixes else _truths(truths, len(runs))
-    methods = {p.stem: _method_of(p) for p in rivals}
+    methods = {f"rival {p.stem}": _method_of(p) for p in rivals}
+    if len(methods) < len(rivals):
+        raise UsageError("two rivals of the same name: rename one of the files")
     say_if_cold(quiet)
     began = time.perf_counter()
     with results_folder(results) as folder, hashed(runs) as hashes:
@@ -110,6 +114,7 @@ def _suite(
 ) -> None:  # fmt: skip
     from itertools import product
 
+    from topograph.config import dump
     from topograph.pipeline.suite import Job, run_suite
     from topograph.report.comparison import records, write_comparison
     from topograph.report.record import write_text
@@ -146,6 +151,7 @@ def _suite(
             "topograph": __version__,
         }
         write_comparison(folder / "report.html", c, facts)
+        write_text(folder / "config.yaml", dump(config))
         record = {"metrics": records(c), "notes": c.notes, "versions": versions()}
         write_text(folder / "metrics.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
     _say(c)
@@ -178,9 +184,7 @@ def _method_of(path: Path) -> Any:
 
 
 def _slug(caption: str) -> str:
-    return "".join(ch if ch.isalnum() or ch in "." else "_" for ch in caption.split(":")[0].lower()) + (
-        "_" + "".join(ch if ch.isalnum() else "_" for ch in caption.rsplit(" ", 1)[-1]) if ":" in caption else ""
-    )
+    return "_".join("".join(ch if ch.isalnum() or ch == "." else " " for ch in caption.lower()).split())
 
 
 def _say(c: Any) -> None:

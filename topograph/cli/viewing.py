@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from topograph.cli.common import check_output, main
-from topograph.errors import InputError, UsageError
+from topograph.errors import TopographError, UsageError
 
 
 @main.command()
@@ -26,11 +26,12 @@ from topograph.errors import InputError, UsageError
 @click.option(
     "--localization", type=click.Path(path_type=Path), help="Results folder of `localize`: replayed on the map."
 )
+@click.option("--force", is_flag=True, help="Replace the page if it is there.")
 @click.option("--serve", is_flag=True, help="Serve the page on 127.0.0.1, clouds on demand, until Ctrl-C.")
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Of --serve; any free one by default.")
 @click.option("--open/--no-open", "open_it", default=False, help="Open the page in the browser.")
 def view(
-    map_file: Path, output: Path | None, html: Path | None, localization: Path | None, serve: bool, port: int, open_it: bool
+    map_file: Path, output: Path | None, html: Path | None, localization: Path | None, force: bool, serve: bool, port: int, open_it: bool
 ) -> None:  # fmt: skip
     """Walk through MAP in a browser, offline: trees, ellipses, edges, clouds from each side, a localization replayed.
 
@@ -46,6 +47,8 @@ def view(
         raise UsageError("--serve writes no page: leave the name out")
     if not serve:
         check_output(target, [map_file], (".html", ".htm"))
+        if target.exists() and not force:
+            raise UsageError(f"{target}: is there already; --force replaces it")
     topo = store.load(map_file, clouds=not serve)
     notes = [] if topo.datum is not None else ["not georeferenced: the frame is the first pose of the run"]
     if topo.meta.get("verdict", "sound") not in ("sound", ""):
@@ -91,12 +94,21 @@ def _handler(text: bytes, map_file: Path, topo: Any) -> type[BaseHTTPRequestHand
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             word = self.path.removeprefix("/clouds/")
-            if self.path in ("/", "/index.html"):
+            host = self.headers.get("Host", "").rpartition(":")[0]
+            if host not in ("127.0.0.1", "localhost"):  # a page of another name that points here
+                self.send_error(403)
+            elif self.path in ("/", "/index.html"):
                 self._send(text, "text/html; charset=utf-8")
-            elif self.path.startswith("/clouds/") and word.isdigit() and int(word) in row:
+            elif (
+                self.path.startswith("/clouds/")
+                and word.isascii()
+                and word.isdigit()
+                and len(word) < 10
+                and int(word) in row
+            ):
                 try:
                     self._send(clouds(int(word)), "application/json")
-                except InputError as err:
+                except TopographError as err:
                     self.send_error(500, str(err))
             else:
                 self.send_error(404)

@@ -52,7 +52,13 @@ def world_in_map(topo: TopoMap, truth: Truth) -> WorldInMap:
         inside = (topo.stamps_ns >= truth.stamps_ns[0]) & (topo.stamps_ns <= truth.stamps_ns[-1])
         if inside.sum() >= 3:
             true = interpolate(truth.stamps_ns, truth.world_T_robot, topo.stamps_ns[inside])[:, :3, 3]
-            return WorldInMap("path", align_se3(true, topo.map_T_robot[inside, :3, 3]))
+            found = topo.map_T_robot[inside, :3, 3]
+            T = align_se3(true, found)
+            off = float(np.sqrt(np.mean(np.sum((transform(T, true) - found)[:, :2] ** 2, axis=1))))
+            if off < SAME_RUN[0] + SAME_RUN[1] * float(
+                np.ptp(true[:, :2], axis=0).max()
+            ):  # else it is another run of the same hours
+                return WorldInMap("path", T)
     fitted = fit_points(truth.trees[:, :2], topo.trees().p[:, :2])
     if fitted is None:
         raise InputError(
@@ -62,6 +68,8 @@ def world_in_map(topo: TopoMap, truth: Truth) -> WorldInMap:
     return WorldInMap("trees", fitted)
 
 
+SAME_RUN = (1.0, 0.08)
+"""A path that is that of the map lies no further from it after alignment, m and share of its extent: what drift may have bent."""
 ALIKE, CLOSE = 0.25, 1.0
 """Distances between two trees that may be the same, m; trees that are one after the fit, m."""
 TRIED = 4000

@@ -56,9 +56,9 @@ def read_one(path: Path) -> Truth:
             order = np.argsort(stamps, kind="stable")
             return Truth.of_path(stamps[order], poses[order])
         if path.suffix in (".geojson", ".json"):
-            return _of_rows(_features(json.loads(path.read_text())), path)
+            return _of_rows(_features(json.loads(path.read_text(encoding="utf-8-sig"))), path)
         if path.suffix == ".csv":
-            with path.open(newline="") as f:
+            with path.open(newline="", encoding="utf-8-sig") as f:
                 return _of_rows(list(csv.DictReader(f)), path)
     except (OSError, ValueError, KeyError, TypeError) as err:
         raise InputError(f"{path}: cannot be read as a truth ({err})") from err

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -20,11 +21,10 @@ SHOWN = 1.5
 
 def write_ros(topo: TopoMap, path: Path) -> None:
     """`/topological_map` (MarkerArray: trunks, edges, addresses), `/path` (Path), `/clusters` (PointCloud2 of all viewpoints)."""
-    if path.exists():
-        path.unlink()
-    folder = path if path.suffix == ".bag" else path.with_name(f".{path.stem}.ros2")
+    folder = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix if path.suffix == '.bag' else ''}")
     if folder.is_dir():
         shutil.rmtree(folder)
+    folder.unlink(missing_ok=True)
     stamp = int(topo.stamps_ns[-1]) if len(topo.stamps_ns) else 1
     with BagWriter(folder) as bag:
         bag.markers("/topological_map", stamp, FRAME, _trunks(topo), _edges(topo), _names(topo))
@@ -35,9 +35,11 @@ def write_ros(topo: TopoMap, path: Path) -> None:
             view = np.zeros(len(cloud), POINT)
             view[:] = cloud
             bag.points("/clusters", stamp, stamp, FRAME, view)
-    if folder != path:  # one file is what Foxglove opens
-        (folder / f"{folder.name}.mcap").replace(path)
-        shutil.rmtree(folder)
+    if path.suffix == ".bag":
+        folder.replace(path)
+        return
+    (folder / f"{folder.name}.mcap").replace(path)  # one file is what Foxglove opens
+    shutil.rmtree(folder)
 
 
 def _trunks(topo: TopoMap) -> list[tuple[Array, Array, float, tuple[float, ...]]]:

@@ -132,7 +132,7 @@ class GraphMethod:
         self._tilt = np.zeros(3)  # z of the base in the map (m), and roll and pitch (rad) beyond what gravity says
         self._tilt_cov = np.diag([100.0, 0.0, 0.0])
         self._vertical = np.array([0.0, 0.0, 1.0])
-        self._row = _row_direction(topo)
+        self._row = row_direction(topo)
         self._slip = SlipWatch()
         self.contradicted = False
         self._last_p = np.zeros((0, 3))
@@ -251,7 +251,7 @@ class GraphMethod:
 _NONE = (np.zeros(0, np.int64), np.zeros((0, 2), np.int64))
 
 
-def _row_direction(topo: TopoMap) -> Array:
+def row_direction(topo: TopoMap) -> Array:
     """Unit vector (2,) along the rows; east where there are none."""
     total = np.zeros(2)
     for row in np.unique(topo.row[topo.row >= 0]):

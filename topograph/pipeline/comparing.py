@@ -43,6 +43,7 @@ class _Work:
 
     out: Comparison
     truths: list[Truth | None]
+    by_fixes: bool = False
     heard: dict[tuple[str, str], Heard] = field(default_factory=dict)
     worlds: dict[str, WorldInMap] = field(default_factory=dict)
 
@@ -69,7 +70,7 @@ def compare_runs(
 ) -> Comparison:
     """Map the first run and localize all of them, by both methods. `by_fixes`: each run's own GNSS, filtered, is its truth (thesis 5.3)."""
     out = Comparison(runs=_names(runs))
-    w = _Work(out, list(truths))
+    w = _Work(out, list(truths), by_fixes)
     configs = {OURS: config, WRITTEN: over(config, "thesis"), BEST: over(config, "thesis_best")}
     for n, path in enumerate(runs):
         for front_end in ("organised", "thesis"):
@@ -88,7 +89,7 @@ def compare_runs(
     if by_fixes:
         w.truths = [fixes_truth(w.heard["organised", r], config) for r in out.runs]
         out.notes.append(
-            "truth: each run's own GNSS through the filter (thesis 5.3); it cannot be better than its fixes, and maps used them too"
+            "truth: each run's own GNSS through the filter (thesis 5.3); it cannot be better than its fixes, maps used them too, and the mapping path of the thesis is that filter, so that paths are not compared"
         )
     _detections(w)
     _maps(w, configs, progress)
@@ -182,11 +183,20 @@ def _maps(w: _Work, configs: dict[str, Config], progress: Progress) -> None:
             _add_map(w, "C map", name, out.maps[name], truth, path)
     _add_map(w, "C map", OURS, out.maps[OURS], truth, (solved.estimate.stamps_ns, solved.estimate.map_T_robot))
     for name, topo in out.maps.items():
-        if truth is not None:
+        if truth is None:
+            continue
+        try:
             w.worlds[name] = world_in_map(topo, truth)
-            if len(truth.trees):
-                out.nodes[name] = node_errors(topo, truth)
-    if truth is not None and len(truth.trees):
+        except TopographError as err:
+            out.notes.append(f"{name}: {err}")
+            continue
+        if w.worlds[name].how != "WGS84":
+            out.notes.append(f"{name}: errors are after the truth was laid onto the map by its {w.worlds[name].how}")
+        if len(truth.trees):
+            out.nodes[name] = node_errors(topo, truth)
+            if not len(out.nodes[name].node):
+                out.notes.append(f"{name}: no node within 2.5 m of a tree of the truth: is it of this orchard?")
+    if truth is not None and len(truth.trees) and OURS in w.worlds:
         out.trees = w.worlds[OURS].points(truth.trees)[:, :2]
     progress("map", 1.0)
 
@@ -230,9 +240,12 @@ def _thesis_map(heard: Heard, config: Config) -> tuple[TopoMap, Any]:
 def _add_map(w: _Work, table: str, name: str, topo: TopoMap, truth: Truth | None, path: Any) -> None:
     metrics = [Metric("nodes", len(topo.trees()))]
     if truth is not None and len(truth.trees):
-        metrics = node_metrics(topo, truth)
-        metrics += [m for m in map_metrics(topo, truth) if "NEES" in m.name]
-    if truth is not None and len(truth.stamps_ns):
+        try:
+            metrics = node_metrics(topo, truth)
+            metrics += [m for m in map_metrics(topo, truth) if "NEES" in m.name]
+        except TopographError as err:
+            w.out.notes.append(f"{name}: {err}")
+    if truth is not None and len(truth.stamps_ns) and not w.by_fixes:  # the thesis's path is that very filter's
         stamps, poses = path
         metrics += path_metrics(stamps, poses, topo.datum, truth.stamps_ns, truth.world_T_robot, truth.datum)
     w.out.rows.append(Row(table, name, w.first, metrics))
@@ -309,17 +322,24 @@ def _localized(
         out.notes.append(f"{run}, {map_name}: not localized ({err})")
         return None
     errors = true_xy = None
-    if truth is not None and len(truth.stamps_ns):
-        world = _world(w, map_name, truth)
+    if truth is not None and len(truth.stamps_ns) and (world := _world_or_note(w, map_name, truth)) is not None:
         errors = localization_errors(replay.reports, truth, world)
         stamps = np.array([r.stamp_ns for r in replay.reports], np.int64)
         true_xy = world.points(interpolate(truth.stamps_ns, truth.world_T_robot, stamps)[:, :3, 3])[:, :2]
     return replay, Track(replay.reports, replay.distance, errors, true_xy)
 
 
+def _world_or_note(w: _Work, map_name: str, truth: Truth) -> WorldInMap | None:
+    try:
+        return _world(w, map_name, truth)
+    except TopographError as err:
+        w.out.notes.append(f"{map_name}: {err}")
+        return None
+
+
 def _world(w: _Work, map_name: str, truth: Truth) -> WorldInMap:
-    """Georeferenced truths find into a map by themselves; a local one is in the frame of the first run's."""
-    if truth.datum is None and map_name in w.worlds:
+    """Georeferenced truths find into a georeferenced map by themselves; else the frame is that of the run that was mapped."""
+    if map_name in w.worlds and (truth.datum is None or w.out.maps[map_name].datum is None):
         return w.worlds[map_name]
     return world_in_map(w.out.maps[map_name], truth)
 
@@ -347,7 +367,9 @@ def _starts(w: _Work, configs: dict[str, Config], n: int, progress: Progress) ->
             continue
         heard = w.heard[front_end, run]
         scans = len(heard.session.trunks)
-        world = _world(w, map_name, truth)
+        world = _world_or_note(w, map_name, truth)
+        if world is None:
+            continue
         found = []
         for k, scan in enumerate(np.linspace(0, 0.8 * scans, n).astype(int).tolist()):
             progress("starts", (c * n + k) / (len(chains) * n))

@@ -5,6 +5,7 @@ A job leaves one file; what is there already is not done again.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import tempfile
@@ -17,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from topograph.config import Config
+from topograph.config import Config, dump
+from topograph.errors import TopographError
 from topograph.evaluate import Metric, read_truth
 from topograph.evaluate.comparison import BEST, OURS, WRITTEN, Comparison, Row
 from topograph.evaluate.statistics import paired_ratio
@@ -53,18 +55,26 @@ def run_suite(
 ) -> Comparison:
     """Do what is not done yet, over `workers` processes, and lay all jobs together."""
     folder.mkdir(parents=True, exist_ok=True)
-    waiting = [j for j in jobs if not _file(folder, j).exists()]
+    waiting = [j for j in jobs if not _file(folder, j, config).exists()]
     progress("suite", 1.0 - len(waiting) / max(len(jobs), 1))
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        lost: list[str] = []
         futures = [pool.submit(_do, j, folder, config) for j in waiting]
         for n, f in enumerate(as_completed(futures)):
-            f.result()
+            try:
+                f.result()
+            except TopographError as err:
+                lost.append(str(err))
             progress("suite", 1.0 - (len(waiting) - n - 1) / max(len(jobs), 1))
-    return together([j for j in jobs if _file(folder, j).exists()], folder)
+    out = together([j for j in jobs if _file(folder, j, config).exists()], folder, config)
+    out.notes += [f"a job ended with: {why}" for why in lost]
+    return out
 
 
-def _file(folder: Path, job: Job) -> Path:
-    return folder / f"{job.name}.json"
+def _file(folder: Path, job: Job, config: Config) -> Path:
+    """What a job leaves; other settings are another job."""
+    key = hashlib.sha256(f"{job}\n{dump(config)}".encode()).hexdigest()[:10]
+    return folder / f"{job.name}-{key}.json"
 
 
 def _do(job: Job, folder: Path, config: Config) -> None:
@@ -90,20 +100,20 @@ def _do(job: Job, folder: Path, config: Config) -> None:
         for r in c.rows
     ]
     text = json.dumps({"job": job.name, "rows": rows, "notes": c.notes}, allow_nan=False)
-    part = _file(folder, job).with_suffix(f".{os.getpid()}.part")
+    part = _file(folder, job, config).with_suffix(f".{os.getpid()}.part")
     part.write_text(text)
-    part.replace(_file(folder, job))
+    part.replace(_file(folder, job, config))
 
 
 def _plain(v: float) -> float | None:
     return float(v) if np.isfinite(v) else None
 
 
-def together(jobs: Sequence[Job], folder: Path) -> Comparison:
+def together(jobs: Sequence[Job], folder: Path, config: Config) -> Comparison:
     """One comparison of all jobs; a run is called by its job. Beside the tables of all stand those of each design."""
     out = Comparison(runs=[j.name for j in jobs])
     for job in jobs:
-        data = json.loads(_file(folder, job).read_text())
+        data = json.loads(_file(folder, job, config).read_text())
         out.notes += [f"{job.name}: {n}" for n in data["notes"] if "not localized" in n or "no map" in n]
         for r in _rows(data["rows"]):
             run = f"{job.name}/{r.run}"

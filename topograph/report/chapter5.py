@@ -25,7 +25,7 @@ def figures(c: Comparison) -> dict[str, bytes]:
     if c.sight is not None:
         out["Fig. 5.6: detections of one sweep, right and wrong"] = detections_figure(c)
     out["Fig. 5.7: the maps over each other"] = maps_figure(c)
-    if c.nodes:
+    if any(len(e.node) for e in c.nodes.values()):
         out["Fig. 5.8: error of each node"] = nodes_figure(c)
         out["Fig. 5.9: histogram of the nodes' errors"] = histogram_figure(c)
     for n, run in enumerate(c.runs):

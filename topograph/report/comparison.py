@@ -37,7 +37,7 @@ ABOUT = {
     ),
     "C map": (
         "C: whole chain against whole chain, the map",
-        "Each method with its own front end, its own path, its own map.",
+        "Each method with its own front end, its own path, its own map. At its best the thesis keeps eq. 4.14, which is its method; table A has the plain mean.",
     ),
     "C": ("C: whole chain against whole chain, localization", "Each method in the map that it made of the first run."),
     "2x2x2": (

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from topograph.errors import InputError
 from topograph.geometry import Array
+from topograph.localize import row_direction
 from topograph.report.record import write_text
 from topograph.report.templates import render
 from topograph.topomap import TopoMap
@@ -175,7 +176,7 @@ def localization_data(
         "x": _f4(column("x")), "y": _f4(column("y")),
         "yaw": _f4(np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy**2 + qz**2))),
         "sigmaA": _f4(np.nan_to_num(column("sigma_along"))), "sigmaB": _f4(np.nan_to_num(column("sigma_across"))),
-        "rowAngle": 0.0,
+        "rowAngle": float(np.arctan2(*row_direction(topo)[::-1])),
         "count": [int(r["hypotheses"]) for r in rows],
         "seenStart": np.concatenate([[0], np.cumsum([len(s) for s in seen])]).tolist(),
         "seen": [t for s in seen for t in s],

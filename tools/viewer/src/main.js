@@ -126,7 +126,7 @@ $('home').addEventListener('click', () => { viewState = fit(); deck.setProps({ v
 $('close').addEventListener('click', () => select(-1));
 if (D.sessions.length > 1) {
   $('session').hidden = false;
-  D.sessions.forEach((s, k) => $('session').append(new Option(s.name, String(k + 1))));
+  D.sessions.slice(0, 30).forEach((s, k) => $('session').append(new Option(s.name, String(k + 1))));
   $('session').addEventListener('change', (e) => { ui.session = Number(e.target.value); draw(); });
 }
 dark.addEventListener('change', () => { ui.dark = dark.matches; draw(); });

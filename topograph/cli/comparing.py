@@ -68,10 +68,8 @@ def compare(
 
     A: the same detections, another estimator. B: the same map and trunks, another localizer. C: whole chain against whole chain.
     """
-    from topograph.config import dump
     from topograph.pipeline.comparing import compare_runs
-    from topograph.report.comparison import records, write_comparison
-    from topograph.report.record import write_text
+    from topograph.report.comparison import write_comparison
 
     if suite == bool(runs):
         raise UsageError("give recordings to compare on, or --suite")
@@ -102,9 +100,7 @@ def compare(
             progress("page", 1.0)
         for caption, png in pictures.items():
             (folder / f"{_slug(caption)}.png").write_bytes(png)
-        write_text(folder / "config.yaml", dump(config))
-        record = {"metrics": records(c), "notes": c.notes, "inputs": hashes(), "versions": versions()}
-        write_text(folder / "metrics.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
+        _keep(folder, c, config, inputs=hashes())
     _say(c)
     click.echo(f"{time.perf_counter() - began:.0f} s; page: {folder / 'report.html'}")
 
@@ -114,10 +110,8 @@ def _suite(
 ) -> None:  # fmt: skip
     from itertools import product
 
-    from topograph.config import dump
     from topograph.pipeline.suite import Job, run_suite
-    from topograph.report.comparison import records, write_comparison
-    from topograph.report.record import write_text
+    from topograph.report.comparison import write_comparison
     from topograph.simulate import DESIGNS
 
     designs, seeds, gnss, driving = words
@@ -151,11 +145,20 @@ def _suite(
             "topograph": __version__,
         }
         write_comparison(folder / "report.html", c, facts)
-        write_text(folder / "config.yaml", dump(config))
-        record = {"metrics": records(c), "notes": c.notes, "versions": versions()}
-        write_text(folder / "metrics.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
+        _keep(folder, c, config)
     _say(c)
     click.echo(f"{time.perf_counter() - began:.0f} s; page: {folder / 'report.html'}")
+
+
+def _keep(folder: Path, c: Any, config: Any, **more: Any) -> None:
+    """The configuration and `metrics.json` beside the page."""
+    from topograph.config import dump
+    from topograph.report.comparison import records
+    from topograph.report.record import write_text
+
+    write_text(folder / "config.yaml", dump(config))
+    record = {"metrics": records(c), "notes": c.notes, **more, "versions": versions()}
+    write_text(folder / "metrics.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
 
 
 def _truths(words: tuple[str, ...], n: int) -> list[Any]:

@@ -40,10 +40,10 @@ class NodeErrors:
     seen: NDArray[np.bool_]
 
 
-def node_errors(topo: TopoMap, truth: Truth, gate: float = GATES[-1]) -> NodeErrors:
-    """Thesis eq. 5.2, node by node (Fig. 5.8); matched at 0.8 m."""
+def node_errors(topo: TopoMap, truth: Truth, gate: float = GATES[-1], world: WorldInMap | None = None) -> NodeErrors:
+    """Thesis eq. 5.2, node by node (Fig. 5.8); matched at 0.8 m. `world`: the truth in the map, where it is known already."""
     topo = topo.trees()
-    world = world_in_map(topo, truth)
+    world = world_in_map(topo, truth) if world is None else world
     true, lifted = world.points(truth.trees), world.points(truth.trees + truth.axes * HEIGHT)
     above = topo.p + topo.axis * (HEIGHT / np.maximum(topo.axis[:, 2:], 0.3))
     i, j = match(above[:, :2], lifted[:, :2], gate)
@@ -53,13 +53,14 @@ def node_errors(topo: TopoMap, truth: Truth, gate: float = GATES[-1]) -> NodeErr
 def node_metrics(topo: TopoMap, truth: Truth) -> list[Metric]:
     """Errors by gate, clipped nowhere: each gate has its own precision and recall beside it."""
     out = [Metric("nodes", len(topo.trees()))]
-    for gate in GATES:
-        e = node_errors(topo, truth, gate)
+    world = world_in_map(topo, truth)
+    found = [node_errors(topo, truth, gate, world) for gate in GATES]
+    for gate, e in zip(GATES, found, strict=True):
         out += [
             Metric(f"precision ({gate:g} m)", len(e.node) / max(e.nodes, 1), "", "higher"),
             Metric(f"recall ({gate:g} m)", float(e.seen[e.tree].sum() / max(e.seen.sum(), 1)), "", "higher"),
         ]
-    e = node_errors(topo, truth)
+    e = found[-1]
     if len(e.node):
         for name, at in (("at 0.8 m", e.above), ("at the foot", e.foot)):
             d = np.hypot(*at.T)

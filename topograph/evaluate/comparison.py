@@ -70,10 +70,6 @@ class Comparison:
     sight: Sight | None = None
     notes: list[str] = field(default_factory=list)
 
-    def tables(self) -> list[str]:
-        """The tables, in order of their first row."""
-        return list(dict.fromkeys(r.table for r in self.rows))
-
     def summary(self) -> list[Figure]:
         """Each figure of each table over the runs, with its interval: what `metrics.json` holds."""
         found: dict[tuple[str, str, str], list[Metric]] = {}

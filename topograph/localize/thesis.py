@@ -103,7 +103,6 @@ class ThesisMethod:
             if len(v.cloud) >= FULL_CLOUD:
                 self._targets[v.tree].append((float(np.arctan2(v.direction[1], v.direction[0])), Target(v.cloud)))
         self.exploded = 0
-        self._z = float(np.median(topo.p[:, 2])) if len(topo) else 0.0
 
     def step(self, trunks: Trunks, leg: Leg) -> Report:
         """One scan further."""

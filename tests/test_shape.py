@@ -8,7 +8,7 @@ import pytest
 from topograph.evaluate.metrics import match
 from topograph.geometry import from_xyz_rpy, inverse, transform
 from topograph.simulate.growth import _girth
-from topograph.trees import Detections, TreesConfig, exists, shapes
+from topograph.trees import Detections, Shapes, TreesConfig, exists, grounds, shapes
 from topograph.trunks.fit import LEAN_SIGMA_PRIOR
 
 HEIGHT = 0.8
@@ -145,3 +145,44 @@ def test_a_false_node_at_the_end_of_a_row_pushes_nobody_aside() -> None:
     i, j = match(found, true)
     assert len(i) == 11
     np.testing.assert_array_equal(i, j + 1)
+
+
+def test_the_ground_is_that_of_the_near_sweeps() -> None:
+    """From afar beams graze the grass and the ground seems higher; the near sweeps know better, though they are fewer. What a tree's
+    sweeps disagree about is in its sigma."""
+    rng = np.random.default_rng(3)
+    poses = np.concatenate([around(8), around(40, 15.0)])
+    scan = np.tile(np.arange(48), 2)
+    tree = np.repeat([0, 1], 48)
+    d = sighted(poses, np.zeros((96, 2)), np.zeros((96, 2)), tree, scan, np.ones(96, np.int64))
+    far = scan >= 8
+    off = np.where(far, 0.12, 0.0) + rng.normal(0, np.where(tree == 0, 0.01, 0.2))
+    d = replace(d, height=d.height - off)
+    z, sigma = grounds(d, tree, poses, 3)
+    assert abs(z[0]) < 0.02
+    assert abs(z[1]) < 0.2
+    assert 0.04 <= sigma[0] < 0.06
+    assert sigma[1] > 0.08
+    assert np.isnan(z[2])
+    recorded = replace(d, kinds=np.full((96, 3), np.nan))
+    assert np.isnan(grounds(recorded, tree, poses, 3)[0]).all()
+
+
+def test_a_second_stem_is_believed_where_trees_fork() -> None:
+    """The same share of sightings that tell two stems apart is a branch in an orchard of single trunks, and a stem where most trees fork;
+    a tree whose second stem nobody saw is the less sure the more others have one."""
+    poses = around(100)
+
+    def run(shares: list[float]) -> Shapes:
+        tree, scan = np.repeat(np.arange(len(shares)), 100), np.tile(np.arange(100), len(shares))
+        stems = np.concatenate([np.where(np.arange(100) % 25 < 25 * s, 2, 1) for s in shares])
+        place = 5.0 * tree[:, None] * np.array([1.0, 0.0])
+        return shapes(sighted(poses, place, np.zeros((len(tree), 2)), tree, scan, stems), tree, poses, len(shares))
+
+    alone, among = run([0.12] + 19 * [0.0]), run([0.12, 0.0] + 8 * [0.6] + 8 * [0.0])
+    assert alone.stems[0] == 1
+    assert among.stems[0] == 2
+    assert among.stems[1] == 1
+    assert among.place_var[1] > alone.place_var[1] + 0.01**2
+    assert (among.stems[2:10] == 2).all()
+    assert (alone.stems[1:] == 1).all()

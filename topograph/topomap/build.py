@@ -15,7 +15,7 @@ from topograph.topomap.edges import TopomapConfig, among
 from topograph.topomap.map import TREE, TopoMap, Viewpoint
 from topograph.topomap.rows import find_rows
 from topograph.topomap.sessions import Seen, SessionRecord
-from topograph.trees import Detections, Existence, Shapes
+from topograph.trees import Detections, Existence, Shapes, grounds
 from topograph.trunks import LEAST_CLOUD
 
 
@@ -35,10 +35,14 @@ def build(
     `detections.source` counts in them.
     """
     n, tree = len(estimate.trees), estimate.tree
-    foot = estimate.trees - s.axis * (s.height / np.maximum(s.axis[:, 2], 0.3))[:, None]
+    ground, ground_sigma = grounds(detections, tree, map_T_scan, n)
+    height = np.where(np.isfinite(ground), estimate.trees[:, 2] - ground, s.height)
+    along = s.axis / np.maximum(s.axis[:, 2:], 0.3)
+    foot = estimate.trees - height[:, None] * along
     cov = estimate.tree_cov.copy()
-    # The foot lies `height` below what was measured: the lean's error carries over.
-    cov[:, [0, 1], [0, 1]] += (s.place_var + s.height**2 * s.slope_var + _no_cylinder(s.diameter) ** 2)[:, None]
+    # The foot lies `height` below what was measured: the lean's error carries over, and the ground's, along the axis.
+    cov[:, [0, 1], [0, 1]] += (s.place_var + height**2 * s.slope_var + _no_cylinder(s.diameter) ** 2)[:, None]
+    cov += np.nan_to_num(ground_sigma)[:, None, None] ** 2 * (along[:, :, None] * along[:, None, :])
     viewpoints = _viewpoints(foot, tree, detections, trunks, map_T_scan, config)
     is_tree = existence.kind == TREE
     edges = among(foot[:, :2], is_tree, config)

@@ -2,6 +2,7 @@
 
 from topograph.trees.detections import Detections, in_order
 from topograph.trees.existence import Existence, exists, seen_through
+from topograph.trees.foot import grounds
 from topograph.trees.keyframes import choose_keyframes
 from topograph.trees.loops import LoopCloser, TrackTable, moved_pose, tabulate
 from topograph.trees.refine import refine
@@ -27,6 +28,7 @@ __all__ = [
     "exists",
     "follow",
     "gather",
+    "grounds",
     "in_order",
     "moved_pose",
     "refine",

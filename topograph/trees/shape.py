@@ -7,9 +7,11 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import beta
 
 from topograph.geometry import Array, inverse, transform
 from topograph.trees.detections import Detections
+from topograph.trees.foot import weighted_median
 
 LEAN_PRIOR = 0.12
 """Sigma of a trunk's lean from the vertical, rad (per axis)."""
@@ -28,7 +30,14 @@ BEND = 0.008
 FORK = 0.4
 """Height above ground at which the stems of one tree are taken to part, m."""
 APART = 0.2
-"""Share of sightings that must see two stems; of single trunks up to a tenth do, by a branch, in dense rows up to a fifth."""
+"""Share of sightings that must see three stems, or four."""
+SHOWN_SINGLE, SHOWN_FORKED = (0.6, 25.0), (1.0, 1.8)
+"""Beta distributions of the share of a tree's nearer sightings that tell two stems apart: of single trunks hardly one in forty, by a
+branch; of forked ones any share, since one stem hides the other from some sides. Simulated olives, seeds below 1000."""
+SURELY = 0.3
+"""Share beyond which a tree forks whatever the others do: posts and wires of a trellis come up to it."""
+USUAL_FORKS = (1.0, 9.0)
+"""Trees' worth of forked and of single ones that a run's share of forked ones is drawn towards."""
 FORKED_LEAN = 0.13
 """Sigma of the lean below the fork about the mean of the stems, rad."""
 MOST_STEMS = 3
@@ -97,6 +106,7 @@ def shapes(
     slope = slope - _seen_lean(slope, weight, away, order, ends) * away
     trust = d.believed / np.maximum(0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1]), 1e-6)
     places, slopes = _Views(n, VIEW_SIGMA), _Views(n, VIEW_LEAN)
+    forked = _forked_probability(_shares(d, order, ends))
     for j in range(n):
         mine = order[ends[j] : ends[j + 1]]
         if not len(mine):
@@ -104,7 +114,7 @@ def shapes(
         out.diameter[j], out.diameter_sigma[j] = _thickness(d, mine)
         above = d.height[mine][np.isfinite(d.height[mine])]
         out.height[j] = np.median(above) if len(above) and measured else common
-        out.stems[j] = _stems(d, mine)
+        out.stems[j] = _stems(d, mine) if forked[j] > 0.5 else 1
         out.forked[j] = out.stems[j] > 1 and (whole is None or j not in whole)
         if out.forked[j]:
             out.slope[j], own = _forked(
@@ -122,7 +132,7 @@ def shapes(
     single = ~out.forked
     out.slope_var[single] = np.minimum(out.slope_var + BEND**2 + slopes.variance(), LEAN_PRIOR**2)[single]
     if measured:  # recorded detections are all spread that way, and the graph learns how far
-        out.place_var[:] = places.variance()
+        out.place_var[:] = places.variance() + np.where(single, forked, 0.0) * (FORK * FORKED_LEAN) ** 2
     return out
 
 
@@ -268,20 +278,43 @@ def _thickness(d: Detections, mine: NDArray[np.int64]) -> tuple[float, float]:
     sigma = d.measured[rows, WIDE_SIGMA]
     near = sigma <= np.percentile(sigma, 50)
     w, x = 1.0 / sigma[near] ** 2, d.measured[rows[near], WIDE]
-    order = np.argsort(x)
-    total = np.cumsum(w[order])
-    middle = float(x[order][np.searchsorted(total, 0.5 * total[-1])])
+    middle = weighted_median(x, w)
     var = float(np.median(sigma[near])) ** 2 / (1.0 + ALIKE * (len(x) - 1)) + 0.015**2
     mean, prior = DIAMETER_PRIOR[0], DIAMETER_PRIOR[1] ** 2
     gain = prior / (prior + var)
     return max(mean + gain * (middle - mean), 0.02), float(np.sqrt(gain * var))
 
 
-def _stems(d: Detections, mine: NDArray[np.int64]) -> int:
-    """Stems that enough of the nearer sightings tell apart: one stem mostly hides the other."""
+def _nearer(d: Detections, mine: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Stems that the nearer half of the sightings told apart."""
     far = np.linalg.norm(d.p[mine, :2], axis=1)
-    near = d.stems[mine[far <= np.median(far)]]
-    return int(max((k for k in range(1, 5) if np.mean(near >= k) >= APART), default=1))
+    return np.asarray(d.stems[mine[far <= np.median(far)]])
+
+
+def _shares(d: Detections, order: NDArray[np.int64], ends: NDArray[np.int64]) -> Array:
+    """Share (T,) of each tree's nearer sightings that told two stems apart; NaN for trees without sightings."""
+    return np.array(
+        [np.mean(_nearer(d, order[a:b]) > 1) if b > a else np.nan for a, b in pairwise(ends.tolist())]
+    ).reshape(-1)
+
+
+def _forked_probability(share: Array) -> Array:
+    """Probability (T,) that a tree forks, from the share of its sightings that say so, and how many trees of the run surely do.
+
+    What looks like a branch in an orchard of single trunks is a stem among trees that mostly have two.
+    """
+    x = np.clip(np.nan_to_num(share), 0.005, 0.95)
+    odds = beta.pdf(x, *SHOWN_FORKED) / beta.pdf(x, *SHOWN_SINGLE)
+    known = np.isfinite(share)
+    surely = np.sum(x[known] > SURELY) / beta.sf(SURELY, *SHOWN_FORKED)
+    rate = min((USUAL_FORKS[0] + surely) / (sum(USUAL_FORKS) + known.sum()), 0.95)
+    return np.where(known, rate * odds / (rate * odds + 1.0 - rate), 0.0)
+
+
+def _stems(d: Detections, mine: NDArray[np.int64]) -> int:
+    """Stems of a tree that forks: as many as enough of the nearer sightings tell apart, one mostly hides another."""
+    near = _nearer(d, mine)
+    return int(max((k for k in range(3, 5) if np.mean(near >= k) >= APART), default=2))
 
 
 def relevelled(detections: Detections, tree: NDArray[np.int64], map_T_scan: Array, s: Shapes) -> Detections:

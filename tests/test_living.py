@@ -1,24 +1,30 @@
 """A run as it is driven: poses on the way, the map at the end, GNSS that comes late, a map that was there before."""
 
-from dataclasses import replace
+import subprocess
+import sys
+from dataclasses import fields, replace
+from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
-from topograph.bags import Fix, Heading, Recording, Trunks
+from topograph.bags import Fix, Heading, Imu, Odometry, Recording, Trunks
+from topograph.cli import main
 from topograph.config import Config
-from topograph.errors import UsageError
+from topograph.errors import InputError, UsageError
 from topograph.evaluate import Truth
-from topograph.evaluate.metrics import tree_errors
+from topograph.evaluate.metrics import match, tree_errors
 from topograph.geometry import inverse
 from topograph.mapping import Mapper
 from topograph.motion import Reckoner
-from topograph.pipeline import extend, live_metrics, play, read_run, solve_run, topo_map
+from topograph.pipeline import JOURNAL, extend, live_metrics, play, read_run, solve_run, topo_map
 from topograph.pipeline.living import Live, State, _Renewed, _Solving
 from topograph.pipeline.mapping import mapping_config
 from topograph.pipeline.read import stream
+from topograph.session import Journal, Journaled
 from topograph.simulate import DriveConfig, SensorConfig, record
 from topograph.topomap import TopoMap
 
@@ -158,3 +164,76 @@ def test_with_a_map_it_localizes_and_adds_what_is_new(folder: Path, batch: TopoM
     assert last.map_T_robot is not None
     apart = (inverse(e.map_T_robot[-1]) @ last.map_T_robot)[:2, 3]
     assert np.linalg.norm(apart) < 0.6  # one keyframe
+
+
+def test_a_run_that_was_killed_is_mapped_from_its_journal(folder: Path, batch: TopoMap) -> None:
+    """SIGKILL in the middle: what was driven until half a second before is there, and its map is that of so much of the recording."""
+    target = folder / "killed.gpkg"
+    program = "from topograph.cli import main; main()"
+    words = ["live", str(folder / "run1.bag"), "-o", str(target), "--speed", "4", "--every", "0"]
+    child = subprocess.Popen([sys.executable, "-c", program, *words], stdout=subprocess.PIPE, text=True, cwd=folder)
+    assert child.stdout is not None
+    for _ in range(180):
+        line = child.stdout.readline()
+    child.kill()
+    child.wait()
+    child.stdout.close()
+    journal = target.with_name(target.name + JOURNAL)
+    assert journal.exists()
+    assert not target.exists()
+    before = journal.read_bytes()
+    played = play([journal], Config())
+    assert journal.read_bytes() == before
+    assert played.solved is not None
+    said = int(float(line.split()[0]) * 10)
+    last = played.states[-1].stamp_ns // 10**8
+    assert last >= said - 10 * 4 * 1  # a second of driving at four times its pace
+    with Recording([folder / "run1.bag"], Config().bags) as recording:
+        span = 0.1 * last - recording.start_ns * 1e-9 + 0.05
+    part = solve_run(read_run([folder / "run1.bag"], Config(), span_s=(0.0, span)), Config())
+    whole, again = topo_map(part, Config(), {}), topo_map(played.solved, Config(), {})
+    i, j = match(again.p[:, :2], whole.p[:, :2])
+    assert len(i) >= len(whole) - 1
+    assert np.linalg.norm(again.p[i] - whole.p[j], axis=1).mean() < 0.01
+    runner = CliRunner()
+    refused = runner.invoke(main, ["live", str(folder / "run1.bag"), "-o", str(target)])
+    assert refused.exit_code == 2
+    assert ".journal" in refused.output
+
+
+def test_a_journal_is_the_run_to_the_last_bit(folder: Path) -> None:
+    config = Config()
+    path = folder / "own.journal"
+    with Recording([folder / "run1.bag"], config.bags) as recording:
+        messages = list(islice(stream(recording, config), 3000))
+        journal = Journal(
+            path,
+            start_ns=recording.start_ns,
+            chosen=dict(recording.chosen),
+            find=recording.frames.find,
+            mount=recording.frames.of,
+        )
+        heard: list[Odometry | Imu | Fix | Heading] = []
+        for m in messages:
+            if isinstance(m, Trunks):
+                journal.add(m, heard)
+                heard = []
+            else:
+                heard.append(m)
+        journal.add(None, heard)
+        journal.close(keep=True)
+        left = Journaled(path)
+        again = [m for trunks, before in left for m in (*before, *([trunks] if trunks is not None else []))]
+        assert left.start_ns == recording.start_ns
+        assert left.chosen == dict(recording.chosen)
+        for frame in ("imu_link", "nowhere"):
+            np.testing.assert_equal(left.find(frame), recording.frames.find(frame))
+        left.close()
+    assert len(again) == len(messages)
+    for one, other in zip(messages, again, strict=True):
+        assert type(one) is type(other)
+        for name in (f.name for f in fields(one)):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name), strict=False)
+    (folder / "no.journal").write_bytes(b"not at all")
+    with pytest.raises(InputError, match="no journal"):
+        play([folder / "no.journal"], config)

@@ -53,6 +53,9 @@ def live(
     """Play BAG as if it were driven now: without a MAP (.gpkg) it maps, with one it localizes in it. At the end the map, of this run or
     of MAP with this run in it, is written to -o; MAP itself stays as it is. Ctrl-C ends the drive there, and the map is made.
 
+    What comes is kept in a journal beside the map until the run is solved: one that was killed is mapped by `topograph live X.gpkg.journal
+    -o Y.gpkg`, but for its last half second.
+
     One line a second says where the robot is and which trees there are. GNSS is taken in when it comes.
     """
     from topograph import pipeline, store
@@ -85,10 +88,24 @@ def live(
         folder = stack.enter_context(results_folder(results))
         target = output or folder / "map.gpkg"
         check_target(target)
+        journal = target.with_name(target.name + pipeline.JOURNAL)
+        if journal.exists():
+            raise UsageError(
+                f"{journal}: a run was cut short here; `topograph live {journal} -o {target.stem}_rescued.gpkg` makes the map of what came until "
+                "then; then remove {journal}*"
+            )
         stack.enter_context(store.locked(target))
         old = store.load(maps[0]) if maps else None
         inputs = stack.enter_context(hashed(paths))
-        played = pipeline.play(paths, config, old, speed=speed, say=say, span_s=(from_s, to_s))
+        played = pipeline.play(
+            paths,
+            config,
+            old,
+            speed=speed,
+            say=say,
+            span_s=(from_s, to_s),
+            journal=None if paths[0].suffix == pipeline.JOURNAL else journal,
+        )
         assert played.solved is not None
         with progress_bar(quiet=True) as progress:
             topo, verdict = save_results(

@@ -16,9 +16,10 @@ from topograph.pipeline.mapping import (
 )
 from topograph.pipeline.placing import has_no_common_gnss, place, refuse_twice
 from topograph.pipeline.read import read_run, scan_near
-from topograph.pipeline.replaying import Played, live_metrics, play
+from topograph.pipeline.replaying import JOURNAL, Played, live_metrics, play
 
 __all__ = [
+    "JOURNAL",
     "Inspection",
     "Placed",
     "Played",

@@ -191,7 +191,7 @@ def _begin(
 ) -> Localizer:
     """A localizer with the mountings that the recording knows."""
     frames = {type(m): (m.frame if isinstance(m, Imu) else m.child_frame) for m in buffer}
-    child_T_robot = child_mount(recording, frames.get(Odometry, config.bags.base_frame), config, notes)
+    child_T_robot = child_mount(recording.frames.find, frames.get(Odometry, config.bags.base_frame), config, notes)
     robot_R_imu = None
     if Imu in frames:
         mount = recording.frames.find(frames[Imu])

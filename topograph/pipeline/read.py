@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -151,7 +151,7 @@ def read_run(
         notes += unknown_mounts(streams, mounts)
         if recording.untimed > UNTIMED * max(len(trunks), 1):
             notes.append(_smear(streams, trunks))
-        child_T_robot = child_mount(recording, streams.frames.get("child", ""), config, notes)
+        child_T_robot = child_mount(recording.frames.find, streams.frames.get("child", ""), config, notes)
         skipped = recording.skipped
         announced = {
             k: recording.given[k] if span_s != WHOLE else recording.counts[t] for k, t in recording.chosen.items()
@@ -304,9 +304,9 @@ def _detect_part(paths: Sequence[Path], config: Config, start_ns: int, stop_ns: 
         return _Part(out, skipped, given, recording.undecoded, recording.clocks.notes, front_end.untimed)
 
 
-def child_mount(recording: Recording, child: str, config: Config, notes: list[str]) -> Array:
+def child_mount(find: Callable[[str], Array | None], child: str, config: Config, notes: list[str]) -> Array:
     """`child_T_robot` (4, 4) of odometry's child frame; the identity, with a note, when TF does not know it."""
-    base_T_child = recording.frames.find(child)
+    base_T_child = find(child)
     if base_T_child is None:
         notes.append(f"odometry's frame {child!r} is not in TF: taken as {config.bags.base_frame!r}")
         base_T_child = np.eye(4)

@@ -1,9 +1,11 @@
-"""A bag, played through `Live` as if it were driven now."""
+"""A bag, or the journal of a run that was cut short, played through `Live` as if it were driven now."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,14 +13,15 @@ import numpy as np
 
 from topograph.bags import Fix, Heading, Imu, Odometry, Recording, Trunks
 from topograph.config import Config
-from topograph.errors import InsufficientDataError
+from topograph.errors import InsufficientDataError, UsageError
 from topograph.evaluate import Metric, Truth
-from topograph.geometry import interpolate
+from topograph.geometry import Array, interpolate
 from topograph.mapping import Mapper, Progress, Solved, silent
 from topograph.motion import Reckoner
 from topograph.pipeline.living import Live, State
 from topograph.pipeline.mapping import mapping_config
 from topograph.pipeline.read import WHOLE, child_mount, refuse_damaged, stream
+from topograph.session import Journal, Journaled
 from topograph.topomap import TopoMap
 
 
@@ -32,6 +35,23 @@ class Played:
     seconds: dict[str, float] = field(default_factory=dict)
 
 
+@dataclass(slots=True)
+class _Source:
+    """What is played: messages in the order of their coming, the mountings of their frames, and what is said of it at the end.
+
+    `check` raises where too much of it could not be read.
+    """
+
+    messages: Iterator[Trunks | Odometry | Imu | Fix | Heading]
+    find: Callable[[str], Array | None]
+    mount: Callable[[str, str], Array | None]
+    chosen: dict[str, str]
+    start_ns: int
+    skipped: Counter[str]
+    notes: Callable[[], list[str]]
+    check: Callable[[], None]
+
+
 def play(
     paths: Sequence[Path],
     config: Config,
@@ -41,66 +61,119 @@ def play(
     say: Callable[[State], None] = lambda _: None,
     progress: Progress = silent,
     span_s: tuple[float, float] = WHOLE,
+    journal: Path | None = None,
 ) -> Played:
-    """Play bags at `speed` times the recording's own pace (0: as fast as it goes), and `say` what is known after each scan.
+    """Play bags, or one journal, at `speed` times the recording's own pace (0: as fast as it goes), and `say` what is known after each
+    scan. `journal`: where what came is kept until the run is solved; it stays there where the process is killed.
 
     Raises:
         InsufficientDataError: no scan, or a run that does not determine its path.
     """
     out = Played()
     began = time.perf_counter()
-    with Recording(paths, config.bags) as recording:
-        live: Live | None = None
-        heard: list[Odometry | Imu | Fix | Heading] = []
-        first_ns = 0
-        try:
-            for m in stream(recording, config, progress, span_s):
-                if not isinstance(m, Trunks):
-                    heard.append(m)
-                    continue
-                if live is None:
-                    live, first_ns = _begin(recording, heard, config, topo, out.notes, speed > 0), m.stamp_ns
-                if speed > 0:
-                    ahead = (m.stamp_ns - first_ns) * 1e-9 / speed - (time.perf_counter() - began)
-                    time.sleep(max(ahead, 0.0))
-                state = live.process(m, heard)
-                heard = []
-                out.states.append(state)
-                say(state)
-        except KeyboardInterrupt:
-            out.notes.append("stopped by hand: what came until then is mapped")
-        refuse_damaged(recording, span_s != WHOLE)
-        if live is None:
-            raise InsufficientDataError("no scan in the recording (or in the part that was asked for)")
-        live.mapper.hear(heard)
-        live.mapper.skipped.update(recording.skipped)
-        out.notes += [*recording.notes, *recording.clocks.notes]
-    out.seconds["play"] = time.perf_counter() - began
-    progress("finish", 0.0)
-    began = time.perf_counter()
-    out.solved = live.finish()
+    kept: Journal | None = None
+    try:
+        with _opened(paths, config, progress, span_s) as source:
+            live: Live | None = None
+            heard: list[Odometry | Imu | Fix | Heading] = []
+            first_ns = 0
+            try:
+                for m in source.messages:
+                    if not isinstance(m, Trunks):
+                        heard.append(m)
+                        continue
+                    if live is None:
+                        live, first_ns = _begin(source, heard, config, topo, out.notes, speed > 0), m.stamp_ns
+                        if journal is not None:
+                            kept = Journal(
+                                journal,
+                                start_ns=source.start_ns,
+                                chosen=source.chosen,
+                                find=source.find,
+                                mount=source.mount,
+                            )
+                    if speed > 0:
+                        ahead = (m.stamp_ns - first_ns) * 1e-9 / speed - (time.perf_counter() - began)
+                        time.sleep(max(ahead, 0.0))
+                    if kept is not None:
+                        kept.add(m, heard)
+                    state = live.process(m, heard)
+                    heard = []
+                    out.states.append(state)
+                    say(state)
+            except KeyboardInterrupt:
+                out.notes.append("stopped by hand: what came until then is mapped")
+            source.check()
+            if live is None:
+                raise InsufficientDataError("no scan in the recording (or in the part that was asked for)")
+            if kept is not None and heard:
+                kept.add(None, heard)
+            live.mapper.hear(heard)
+            live.mapper.skipped.update(source.skipped)
+            out.notes += source.notes()
+        out.seconds["play"] = time.perf_counter() - began
+        progress("finish", 0.0)
+        began = time.perf_counter()
+        out.solved = live.finish()
+    finally:
+        if kept is not None:
+            kept.close(keep=False)  # what is played is still there
     out.seconds["finish"] = time.perf_counter() - began
     progress("finish", 1.0)
     return out
 
 
+@contextmanager
+def _opened(
+    paths: Sequence[Path], config: Config, progress: Progress, span_s: tuple[float, float]
+) -> Iterator[_Source]:
+    """The bags, or the one journal."""
+    if any(p.suffix == JOURNAL for p in paths):
+        if len(paths) > 1 or span_s != WHOLE:
+            raise UsageError(f"{JOURNAL}: one journal at a time, and the whole of it")
+        with closing(Journaled(paths[0])) as left:
+            yield _Source(
+                messages=(m for trunks, heard in left for m in (*heard, *(() if trunks is None else (trunks,)))),
+                find=left.find,
+                mount=left.mount,
+                chosen=left.chosen,
+                start_ns=left.start_ns,
+                skipped=Counter(),
+                notes=lambda: ["made of the journal of a run that was cut short"],
+                check=lambda: None,
+            )
+        return
+    with Recording(paths, config.bags) as recording:
+        yield _Source(
+            messages=stream(recording, config, progress, span_s),
+            find=recording.frames.find,
+            mount=recording.frames.of,
+            chosen=dict(recording.chosen),
+            start_ns=recording.start_ns,
+            skipped=recording.skipped,
+            notes=lambda: [*recording.notes, *recording.clocks.notes],
+            check=lambda: refuse_damaged(recording, span_s != WHOLE),
+        )
+
+
+JOURNAL = ".journal"
+"""How a journal's name ends."""
+
+
 def _begin(
-    recording: Recording,
+    source: _Source,
     heard: Sequence[Odometry | Imu | Fix | Heading],
     config: Config,
     topo: TopoMap | None,
     notes: list[str],
     background: bool,
 ) -> Live:
-    """A `Live` with the mountings that the recording knows."""
+    """A `Live` with the mountings that the source knows."""
     child = next((m.child_frame for m in heard if isinstance(m, Odometry)), config.bags.base_frame)
     imu = next((m.frame for m in heard if isinstance(m, Imu)), None)
-    mount = None if imu is None else recording.frames.find(imu)
-    mapper = Mapper(
-        mapping_config(config), recording.frames.find, recording.frames.of, dict(recording.chosen), recording.start_ns
-    )
-    child_T_robot = child_mount(recording, child, config, notes)
-    reckoner = Reckoner(child_T_robot, None if mount is None else mount[:3, :3])
+    mount = None if imu is None else source.find(imu)
+    mapper = Mapper(mapping_config(config), source.find, source.mount, source.chosen, source.start_ns)
+    reckoner = Reckoner(child_mount(source.find, child, config, notes), None if mount is None else mount[:3, :3])
     return Live(mapper, config, reckoner, topo, background=background)
 
 

@@ -47,6 +47,16 @@ def to_quaternion(pose: ArrayLike) -> Array:
     return np.asarray(q).reshape(*T.shape[:-2], 4)
 
 
+def tangent_cov(poses: Array, cov: Array) -> Array:
+    """Covariances (N, 6, 6) of x, y, z, then roll, pitch, yaw in each body's own frame (right perturbation, translation first), from those of
+    roll, pitch, yaw, then x, y, z about the map's axes.
+    """
+    turn = np.zeros((len(poses), 6, 6))
+    back = np.swapaxes(poses[:, :3, :3], 1, 2)
+    turn[:, :3, 3:] = turn[:, 3:, :3] = back
+    return np.asarray(turn @ cov @ np.swapaxes(turn, 1, 2))
+
+
 def from_xyz_rpy(x: float, y: float, z: float, roll: float, pitch: float, yaw: float) -> Array:
     """One pose (4, 4) from metres and fixed-axis roll, pitch, yaw in radians (the URDF order)."""
     return se3(Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix(), [x, y, z])

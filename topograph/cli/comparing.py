@@ -30,10 +30,12 @@ from topograph.errors import InputError, UsageError
 @click.argument("runs", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--truth", "truths", multiple=True, metavar="TRUTH",
               help="A simulator's folder, a .tum path, trees as .csv or .geojson, or `fixes` (each run's own GNSS, filtered, as the thesis had "
-                   "it). Once for all runs, or once for each, in order; A+B lays two together.")  # fmt: skip
+                   "it), or `fixes/N` (every N-th fix alone, which no map is then made with). Once for all runs, or once for each, in order; A+B lays two together.")  # fmt: skip
 @click.option(
     "--starts", type=click.IntRange(0), default=16, show_default=True, help="Starts along the first run (Fig. 5.14)."
 )
+@click.option("--image", type=click.Path(path_type=Path),
+              help="A GeoTIFF (orthophoto, satellite) that is drawn under the maps (needs rasterio: topograph[exchange]).")  # fmt: skip
 @click.option("--ablations", is_flag=True, help="Also leave each part out in turn.")
 @click.option("--rival", "rivals", multiple=True, type=click.Path(path_type=Path),
               help="A Python file with `method(topo, config)`, a localizer with `step(trunks, leg) -> Report`; it joins table B.")  # fmt: skip
@@ -61,7 +63,7 @@ from topograph.errors import InputError, UsageError
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 @input_options
 def compare(
-    runs: tuple[Path, ...], truths: tuple[str, ...], starts: int, ablations: bool, rivals: tuple[Path, ...], suite: bool,
+    runs: tuple[Path, ...], truths: tuple[str, ...], starts: int, image: Path | None, ablations: bool, rivals: tuple[Path, ...], suite: bool,
     designs: str, seeds: str, gnss: str, driving: str, longest: float, detections: bool, jobs: int, results: Path | None, quiet: bool, config_file: Path | None, **words: Any,
 ) -> None:  # fmt: skip
     """Both methods on RUNS: map the first, localize all. Chapter 5's tables and figures, three questions, one page.
@@ -74,15 +76,15 @@ def compare(
     if suite == bool(runs):
         raise UsageError("give recordings to compare on, or --suite")
     config = config_of(config_file, words)
-    if suite and (truths or rivals or ablations):
-        raise UsageError("--suite simulates its own truth, and takes neither --truth nor --rival nor --ablations")
+    if suite and (truths or rivals or ablations or image):
+        raise UsageError("--suite simulates its own truth, and takes neither --truth, --rival, --image nor --ablations")
     if suite:
         _suite(config, (designs, seeds, gnss, driving), longest, detections, starts, jobs, results, quiet)
         return
-    for p in runs:
+    for p in (*runs, *([] if image is None else [image])):
         if not p.exists():
-            raise InputError(f"{p}: no such recording")
-    by_fixes = truths == ("fixes",)
+            raise InputError(f"{p}: no such file")
+    by_fixes = _by_fixes(truths)
     true = [None] * len(runs) if by_fixes else _truths(truths, len(runs))
     methods = {f"rival {p.stem}": _method_of(p) for p in rivals}
     if len(methods) < len(rivals):
@@ -92,7 +94,7 @@ def compare(
     with results_folder(results) as folder, hashed(runs) as hashes:
         with progress_bar(quiet) as progress:
             c = compare_runs(
-                list(runs), true, config, starts=starts, ablations=ablations, by_fixes=by_fixes, rivals=methods, progress=progress
+                list(runs), true, config, starts=starts, ablations=ablations, by_fixes=by_fixes, image=image, rivals=methods, progress=progress
             )  # fmt: skip
             progress("page", 0.0)
             facts = {"runs": ", ".join(c.runs), "truth": ", ".join(truths) or "none", "topograph": __version__}
@@ -161,8 +163,20 @@ def _keep(folder: Path, c: Any, config: Any, **more: Any) -> None:
     write_text(folder / "metrics.json", json.dumps(record, indent=1, allow_nan=False) + "\n")
 
 
+def _by_fixes(words: tuple[str, ...]) -> int:
+    """0: the truth is something else; 1: all fixes; N: every N-th."""
+    if len(words) != 1 or not words[0].startswith("fixes"):
+        return 0
+    _, _, n = words[0].partition("/")
+    if words[0] == "fixes":
+        return 1
+    if not n.isdigit() or int(n) < 2:
+        raise UsageError(f"--truth {words[0]}: give fixes, or fixes/N with N from 2 on")
+    return int(n)
+
+
 def _truths(words: tuple[str, ...], n: int) -> list[Any]:
-    if "fixes" in words:
+    if any(w.startswith("fixes") and not Path(w).exists() for w in words):
         raise UsageError("--truth fixes is for all runs: give it alone")
     found = [truth_of([Path(p) for p in w.split("+")]) for w in words]
     if not found:

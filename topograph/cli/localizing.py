@@ -54,7 +54,8 @@ def localize(
     from topograph.evaluate import world_in_map, write_tum
     from topograph.evaluate.localization import localization_errors, localization_metrics, path_errors
     from topograph.evaluate.metrics import Metric
-    from topograph.geometry import interpolate
+    from topograph.exchange import write_wide_tum
+    from topograph.geometry import interpolate, tangent_cov
     from topograph.report import localization_error_figure, localization_figure, write_json, write_page
     from topograph.report.record import write_text
     from topograph.report.viewer import localization_data, write_viewer
@@ -92,6 +93,11 @@ def localize(
         fixes = run.fixes
         poses = np.array([f.map_T_robot for f in fixes]).reshape(-1, 4, 4)
         write_tum(folder / "localization.tum", np.array([f.stamp_ns for f in fixes], np.int64), poses)
+        if len(fixes) and all(np.isfinite(f.cov).all() for f in fixes):
+            cov = tangent_cov(poses, np.array([f.cov for f in fixes]))
+            write_wide_tum(
+                folder / "localization_wide.tum", np.array([f.stamp_ns for f in fixes], np.int64), poses, cov
+            )
         write_tum(folder / "smoothed.tum", *run.smoothed)
         write_text(folder / "localization.csv", _csv(run.reports))
         write_text(folder / "hypotheses.csv", _hypotheses(run.reports))

@@ -11,6 +11,7 @@ from topograph.evaluate.chapter5 import NodeErrors, Sight, Start
 from topograph.evaluate.localization import LocalizationErrors
 from topograph.evaluate.metrics import Metric
 from topograph.evaluate.statistics import bootstrap, wilson
+from topograph.exchange import Underlay
 from topograph.geometry import Array
 from topograph.localize import Report
 from topograph.topomap import TopoMap
@@ -57,6 +58,7 @@ class Comparison:
         tracks: (method, run) -> how the whole chain localized it.
         starts: method -> starts in the first run.
         sight: a scan of the first run, or None.
+        underlay: a picture of the place, in our map's frame, or None.
         notes: what had to be left out, and why.
     """
 
@@ -68,6 +70,7 @@ class Comparison:
     tracks: dict[tuple[str, str], Track] = field(default_factory=dict)
     starts: dict[str, list[Start]] = field(default_factory=dict)
     sight: Sight | None = None
+    underlay: Underlay | None = None
     notes: list[str] = field(default_factory=list)
 
     def summary(self) -> list[Figure]:

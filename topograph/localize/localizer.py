@@ -123,6 +123,10 @@ class Localizer:
             return none_at(scan.stamp_ns)
 
 
+GROUND_SIGMA = 0.08
+"""What the grounds that a sweep sees under its trees are off by in common (grass, slope within a cell), m."""
+
+
 class GraphMethod:
     """Ours: submap, search, evidence, track (see `Engine`), lifted from the plane to six degrees of freedom."""
 
@@ -137,6 +141,7 @@ class GraphMethod:
         self.contradicted = False
         self._last_p = np.zeros((0, 3))
         self._seen_at = 0.0
+        self._ground = GROUND_SIGMA**2
 
     def _begin(self, trunks: Trunks) -> Engine:
         """The index is built at the height at which this front end states its trunks."""
@@ -225,6 +230,7 @@ class GraphMethod:
         drift = (0.001 if leg.level else 0.02) ** 2 * leg.distance
         P += np.diag([(0.03 * leg.distance) ** 2 + 1e-6, drift, drift])
         for i, t in belief.pairs:
+            self._ground += 0.02 * (GROUND_SIGMA**2 + _known(self.topo.cov[t, 2, 2]) - self._ground)
             ground = self.topo.p[t, 2] + (trunks.height[i] if np.isfinite(trunks.height[i]) else self.height)
             H = np.array([1.0, flat[i, 1], -flat[i, 0]])
             S = H @ P @ H + 0.12**2 + (0.01 * np.hypot(*flat[i, :2])) ** 2
@@ -243,9 +249,16 @@ class GraphMethod:
         cov[np.ix_([5, 0, 1], [5, 0, 1])] = self._tilt_cov
         cov[[0, 1], [0, 1]] += 0.01**2
         cov[[3, 4], [3, 4]] += self._slip.standing**2
+        # What all trees of the map, or all grounds under them, have in common no number of sightings takes away.
+        cov[3:, 3:] += np.nan_to_num(self.topo.datum_cov)
+        cov[5, 5] += self._ground
         if not leg.level:  # trunks that are seen so high above the base are shifted by the tilt, all alike
             cov[[3, 4], [3, 4]] += (UNKNOWN_TILT * self._seen_at) ** 2
         return Fix(stamp_ns, T, cov, belief.risk)
+
+
+def _known(variance: float) -> float:
+    return float(variance) if np.isfinite(variance) else 0.0
 
 
 _NONE = (np.zeros(0, np.int64), np.zeros((0, 2), np.int64))

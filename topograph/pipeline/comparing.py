@@ -28,6 +28,8 @@ from topograph.evaluate.chapter5 import (
 )
 from topograph.evaluate.comparison import BEST, OURS, WRITTEN, Comparison, Row, Track
 from topograph.evaluate.localization import localization_errors, localization_metrics
+from topograph.evaluate.outside import smfeval_metrics
+from topograph.exchange import Underlay, read_underlay
 from topograph.geometry import interpolate
 from topograph.localize import GraphMethod, Method, ThesisMethod
 from topograph.mapping import Progress, prepare, silent
@@ -64,13 +66,19 @@ def compare_runs(
     *,
     starts: int = 16,
     ablations: bool = False,
-    by_fixes: bool = False,
+    by_fixes: int = 0,
+    image: Path | None = None,
     rivals: dict[str, MethodOf] | None = None,
     progress: Progress = silent,
 ) -> Comparison:
-    """Map the first run and localize all of them, by both methods. `by_fixes`: each run's own GNSS, filtered, is its truth (thesis 5.3)."""
+    """Map the first run and localize all of them, by both methods.
+
+    Args:
+        by_fixes: each run's own GNSS, filtered, is its truth (thesis 5.3): 1 all of it, N every N-th fix, which no map is then made with.
+        image: a georeferenced picture that is drawn under the maps.
+    """
     out = Comparison(runs=_names(runs))
-    w = _Work(out, list(truths), by_fixes)
+    w = _Work(out, list(truths), by_fixes == 1)
     configs = {OURS: config, WRITTEN: over(config, "thesis"), BEST: over(config, "thesis_best")}
     for n, path in enumerate(runs):
         for front_end in ("organised", "thesis"):
@@ -87,12 +95,14 @@ def compare_runs(
             "recorded trunk detections, no point clouds: both methods have the same front end, and ICP has no clouds"
         )
     if by_fixes:
-        w.truths = [fixes_truth(w.heard["organised", r], config) for r in out.runs]
-        out.notes.append(
-            "truth: each run's own GNSS through the filter (thesis 5.3); it cannot be better than its fixes, maps used them too, and the mapping path of the thesis is that filter, so that paths are not compared"
-        )
+        w.truths = [fixes_truth(with_fixes(w.heard["organised", r], by_fixes, True), config) for r in out.runs]
+        if by_fixes > 1:
+            w.heard = {k: with_fixes(h, by_fixes, False) for k, h in w.heard.items()}
+        out.notes.append(BY_FIXES if by_fixes == 1 else BY_WITHHELD.format(n=by_fixes))
     _detections(w)
     _maps(w, configs, progress)
+    if image is not None:
+        out.underlay = _underlay(image, out.maps[OURS], out.notes)
     _per_run(w, configs)
     _localizers(w, configs, rivals or {}, progress)
     _starts(w, configs, starts, progress)
@@ -106,6 +116,30 @@ def _names(runs: Sequence[Path]) -> list[str]:
     """What the runs are called: their stems, numbered where two are alike."""
     stems = [p.stem for p in runs]
     return [f"{s} ({n + 1})" if stems.count(s) > 1 else s for n, s in enumerate(stems)]
+
+
+BY_FIXES = (
+    "truth: each run's own GNSS through the filter (thesis 5.3); it cannot be better than its fixes, maps used them too, and the mapping path "
+    "of the thesis is that filter, so that paths are not compared"
+)
+BY_WITHHELD = "truth: every fix number {n} of each run's own GNSS, through the filter (thesis 5.3), withheld from all maps; wheels and IMU are in both"
+
+
+def with_fixes(heard: Heard, n: int, withheld: bool) -> Heard:
+    """The run with every `n`-th fix, or (not `withheld`) with all others."""
+    s = heard.session.streams
+    keep = (np.arange(len(s.fix_ns)) % n == 0) == withheld
+    streams = replace(s, **{k: getattr(s, k)[keep] for k in ("fix_ns", "lat_lon_h", "fix_cov", "fix_status")})
+    return replace(heard, session=replace(heard.session, streams=streams))
+
+
+def _underlay(image: Path, topo: TopoMap, notes: list[str]) -> Underlay | None:
+    """The part of the picture that the map covers, with a margin."""
+    if topo.datum is None:
+        notes.append(f"{image.name}: not drawn, the map is not georeferenced")
+        return None
+    seen = np.concatenate([topo.p[:, :2], topo.map_T_robot[:, :2, 3]])
+    return read_underlay(image, topo.datum, seen.min(axis=0) - 8.0, seen.max(axis=0) + 8.0)
 
 
 def fixes_truth(heard: Heard, config: Config) -> Truth | None:
@@ -290,7 +324,7 @@ def _localizers(w: _Work, configs: dict[str, Config], rivals: dict[str, MethodOf
     jobs.append(("C", OURS, "organised", OURS, by_graph, config))
     jobs.append(("C", BEST, "thesis", BEST, by_thesis, configs[BEST]))
     jobs.append(("C", WRITTEN, "thesis", WRITTEN, by_thesis, configs[WRITTEN]))
-    done: dict[tuple[str, str, MethodOf, int, str], tuple[Replay, Track]] = {}
+    done: dict[tuple[str, str, MethodOf, int, str], tuple[Replay, Track, list[Metric]]] = {}
     for n, (table, name, front_end, map_name, method, c) in enumerate(jobs):
         if map_name not in out.maps:
             continue
@@ -306,14 +340,14 @@ def _localizers(w: _Work, configs: dict[str, Config], rivals: dict[str, MethodOf
                 out.tracks[name, run] = done[key][1]
             r, e = done[key][0], done[key][1].errors
             metrics = localization_metrics(r.reports, r.distance, r.update_ms, None)
-            metrics += [] if e is None else error_metrics(e)
+            metrics += [] if e is None else error_metrics(e) + done[key][2]
             out.rows.append(Row(table, name, run, metrics))
     progress("localize", 1.0)
 
 
 def _localized(
     w: _Work, front_end: str, map_name: str, run: str, truth: Truth | None, method: MethodOf, config: Config
-) -> tuple[Replay, Track] | None:
+) -> tuple[Replay, Track, list[Metric]] | None:
     out = w.out
     topo = out.maps[map_name]
     try:
@@ -322,11 +356,13 @@ def _localized(
         out.notes.append(f"{run}, {map_name}: not localized ({err})")
         return None
     errors = true_xy = None
+    outside: list[Metric] = []
     if truth is not None and len(truth.stamps_ns) and (world := _world_or_note(w, map_name, truth)) is not None:
         errors = localization_errors(replay.reports, truth, world)
+        outside = smfeval_metrics(replay.reports, truth, world)
         stamps = np.array([r.stamp_ns for r in replay.reports], np.int64)
         true_xy = world.points(interpolate(truth.stamps_ns, truth.world_T_robot, stamps)[:, :3, 3])[:, :2]
-    return replay, Track(replay.reports, replay.distance, errors, true_xy)
+    return replay, Track(replay.reports, replay.distance, errors, true_xy), outside
 
 
 def _world_or_note(w: _Work, map_name: str, truth: Truth) -> WorldInMap | None:

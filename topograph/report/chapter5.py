@@ -73,6 +73,8 @@ def maps_figure(c: Comparison) -> bytes:
     figure = Figure(figsize=(9, 7))
     ax = figure.add_subplot()
     ours = c.maps[OURS]
+    if c.underlay is not None:
+        ax.imshow(c.underlay.pixels, extent=c.underlay.extent, zorder=0)
     ax.plot(*ours.map_T_robot[:, :2, 3].T, color=PATH, lw=0.8, alpha=0.7, label="path")
     if c.trees is not None:
         ax.plot(*c.trees.T, "k+", ms=11, mew=1.4, label="truth", zorder=5)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from topograph.bags import Fix, Heading, Imu, Odometry, Recording, Trunks
+from topograph.bags import Fix, Heading, Imu, Recording, Trunks
 from topograph.cli import main
 from topograph.config import Config
 from topograph.errors import InputError, UsageError
@@ -213,22 +213,15 @@ def test_a_journal_is_the_run_to_the_last_bit(folder: Path) -> None:
             find=recording.frames.find,
             mount=recording.frames.of,
         )
-        heard: list[Odometry | Imu | Fix | Heading] = []
         for m in messages:
-            if isinstance(m, Trunks):
-                journal.add(m, heard)
-                heard = []
-            else:
-                heard.append(m)
-        journal.add(None, heard)
-        journal.close(keep=True)
+            journal.see(m) if isinstance(m, Trunks) else journal.hear(m)
+        journal.close()
         left = Journaled(path)
-        again = [m for trunks, before in left for m in (*before, *([trunks] if trunks is not None else []))]
+        again = list(left.messages())
         assert left.start_ns == recording.start_ns
         assert left.chosen == dict(recording.chosen)
         for frame in ("imu_link", "nowhere"):
             np.testing.assert_equal(left.find(frame), recording.frames.find(frame))
-        left.close()
     assert len(again) == len(messages)
     for one, other in zip(messages, again, strict=True):
         assert type(one) is type(other)
@@ -237,3 +230,34 @@ def test_a_journal_is_the_run_to_the_last_bit(folder: Path) -> None:
     (folder / "no.journal").write_bytes(b"not at all")
     with pytest.raises(InputError, match="no journal"):
         play([folder / "no.journal"], config)
+    whole = path.read_bytes()
+    scans = sum(isinstance(m, Trunks) for m in messages)
+    for cut in (len(whole) - 7, len(whole) // 2):
+        path.write_bytes(whole[:cut])
+        torn = Journaled(path)
+        assert sum(isinstance(m, Trunks) for m in torn.messages()) >= scans * cut // len(whole) - 2
+    spoiled = bytearray(whole)
+    spoiled[len(whole) // 2 : len(whole) // 2 + 40] = bytes(40)
+    path.write_bytes(spoiled)
+    torn = Journaled(path)
+    assert sum(isinstance(m, Trunks) for m in torn.messages()) >= scans - 2
+    assert torn.damaged >= 1
+
+
+def test_what_comes_between_scans_does_not_wait(folder: Path) -> None:
+    """A silent LiDAR: messages are on disk half a second later, though no scan comes; a disk that is full ends the journal, not the drive."""
+    path = folder / "slow.journal"
+    journal = Journal(path, start_ns=1, chosen={}, find=lambda _: None, mount=lambda _, __: None)
+    m = Imu(5, "imu", np.ones(3), np.ones(3))
+    journal.hear(m)
+    journal._written -= 1.0
+    journal.hear(m)
+    assert len(list(Journaled(path).messages())) == 2  # it was not closed
+    full = Path("/dev/full")
+    if full.exists():
+        journal._file.close()
+        journal._file = full.open("wb", buffering=0)
+        journal.hear(m)
+        journal.flush()
+        assert "ends early" in journal.broken
+        journal.close()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -26,7 +28,7 @@ from topograph.cli.common import (
     table,
     truth_of,
 )
-from topograph.errors import UsageError
+from topograph.errors import InputError, TopographError, UsageError
 
 
 @main.command()
@@ -53,7 +55,7 @@ def live(
     """Play BAG as if it were driven now: without a MAP (.gpkg) it maps, with one it localizes in it. At the end the map, of this run or
     of MAP with this run in it, is written to -o; MAP itself stays as it is. Ctrl-C ends the drive there, and the map is made.
 
-    What comes is kept in a journal beside the map until the run is solved: one that was killed is mapped by `topograph live X.gpkg.journal
+    What comes is kept in a journal beside the map until that is written: a run that was cut short is mapped by `topograph live X.gpkg.journal
     -o Y.gpkg`, but for its last half second.
 
     One line a second says where the robot is and which trees there are. GNSS is taken in when it comes.
@@ -88,31 +90,59 @@ def live(
         folder = stack.enter_context(results_folder(results))
         target = output or folder / "map.gpkg"
         check_target(target)
-        journal = target.with_name(target.name + pipeline.JOURNAL)
-        if journal.exists():
-            raise UsageError(
-                f"{journal}: a run was cut short here; `topograph live {journal} -o {target.stem}_rescued.gpkg` makes the map of what came until "
-                "then; then remove {journal}*"
-            )
         stack.enter_context(store.locked(target))
+        journal = None if paths[0].suffix == pipeline.JOURNAL else target.with_name(target.name + pipeline.JOURNAL)
+        if journal is not None and journal.exists():
+            raise UsageError(f"{journal}: a run was cut short here; `{_rescue(journal)}` makes its map; then remove it")
+        if journal is None:
+            _same_map(paths[0], maps)
+        elif not quiet:
+            click.echo(f"what comes is kept in {journal} until the map is written", err=True)
         old = store.load(maps[0]) if maps else None
         inputs = stack.enter_context(hashed(paths))
-        played = pipeline.play(
-            paths,
-            config,
-            old,
-            speed=speed,
-            say=say,
-            span_s=(from_s, to_s),
-            journal=None if paths[0].suffix == pipeline.JOURNAL else journal,
-        )
-        assert played.solved is not None
-        with progress_bar(quiet=True) as progress:
-            topo, verdict = save_results(
-                played.solved, config, inputs, paths, folder, target, true, old, progress, accept
+        about = {"map": str(maps[0].resolve())} if maps else {}
+        try:
+            played = pipeline.play(
+                paths, config, old, speed=speed, say=say, span_s=(from_s, to_s), journal=journal, about=about
             )
+            assert played.solved is not None
+            with progress_bar(quiet=True) as progress:
+                topo, verdict = save_results(
+                    played.solved, config, inputs, paths, folder, target, true, old, progress, accept
+                )
+        except TopographError:  # what was played is there, and would end the same
+            if journal is not None:
+                journal.unlink(missing_ok=True)
+            raise
+        except BaseException:
+            if journal is not None and journal.exists():
+                click.echo(f"topograph: cut short; `{_rescue(journal)}` makes the map of what came", err=True)
+            raise
+        if journal is not None:
+            journal.unlink(missing_ok=True)
     table(pipeline.live_metrics(played, true))
     say_verdict(played.solved, topo, verdict, folder, target, [*played.notes, *played.solved.run.notes])
+
+
+def _rescue(journal: Path) -> str:
+    """The command that makes the map of a journal."""
+    from topograph.session import Journaled
+
+    try:
+        old = Journaled(journal).about.get("map")
+    except InputError:  # begun, and no more
+        old = None
+    target = journal.with_name(journal.name.removesuffix(".gpkg.journal") + "_rescued.gpkg")
+    return shlex.join(["topograph", "live", str(journal), *([old] if old else []), "-o", str(target)])
+
+
+def _same_map(journal: Path, maps: Sequence[Path]) -> None:
+    """Raise UsageError where a run was driven in a map that is not given now."""
+    from topograph.session import Journaled
+
+    old = Journaled(journal).about.get("map")
+    if old and not maps:
+        raise UsageError(f"{journal}: was driven in a map: {_rescue(journal)}")
 
 
 def line(s: Any) -> str:

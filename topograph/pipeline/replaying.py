@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -62,62 +62,58 @@ def play(
     progress: Progress = silent,
     span_s: tuple[float, float] = WHOLE,
     journal: Path | None = None,
+    about: dict[str, str] | None = None,
 ) -> Played:
     """Play bags, or one journal, at `speed` times the recording's own pace (0: as fast as it goes), and `say` what is known after each
-    scan. `journal`: where what came is kept until the run is solved; it stays there where the process is killed.
+    scan. `journal`: a file that is begun for what comes, with facts `about` it; it stays there.
 
     Raises:
         InsufficientDataError: no scan, or a run that does not determine its path.
     """
     out = Played()
     began = time.perf_counter()
-    kept: Journal | None = None
-    try:
-        with _opened(paths, config, progress, span_s) as source:
-            live: Live | None = None
-            heard: list[Odometry | Imu | Fix | Heading] = []
-            first_ns = 0
-            try:
-                for m in source.messages:
-                    if not isinstance(m, Trunks):
-                        heard.append(m)
-                        continue
-                    if live is None:
-                        live, first_ns = _begin(source, heard, config, topo, out.notes, speed > 0), m.stamp_ns
-                        if journal is not None:
-                            kept = Journal(
-                                journal,
-                                start_ns=source.start_ns,
-                                chosen=source.chosen,
-                                find=source.find,
-                                mount=source.mount,
-                            )
-                    if speed > 0:
-                        ahead = (m.stamp_ns - first_ns) * 1e-9 / speed - (time.perf_counter() - began)
-                        time.sleep(max(ahead, 0.0))
+    with _opened(paths, config, progress, span_s) as source, ExitStack() as stack:
+        kept: Journal | None = None
+        if journal is not None:
+            kept = Journal(
+                journal, start_ns=source.start_ns, chosen=source.chosen, find=source.find, mount=source.mount, about=about
+            )  # fmt: skip
+            stack.callback(kept.close)
+        live: Live | None = None
+        heard: list[Odometry | Imu | Fix | Heading] = []
+        first_ns = 0
+        try:
+            for m in source.messages:
+                if not isinstance(m, Trunks):
+                    heard.append(m)
                     if kept is not None:
-                        kept.add(m, heard)
-                    state = live.process(m, heard)
-                    heard = []
-                    out.states.append(state)
-                    say(state)
-            except KeyboardInterrupt:
-                out.notes.append("stopped by hand: what came until then is mapped")
-            source.check()
-            if live is None:
-                raise InsufficientDataError("no scan in the recording (or in the part that was asked for)")
-            if kept is not None and heard:
-                kept.add(None, heard)
-            live.mapper.hear(heard)
-            live.mapper.skipped.update(source.skipped)
-            out.notes += source.notes()
-        out.seconds["play"] = time.perf_counter() - began
-        progress("finish", 0.0)
-        began = time.perf_counter()
-        out.solved = live.finish()
-    finally:
-        if kept is not None:
-            kept.close(keep=False)  # what is played is still there
+                        kept.hear(m)
+                    continue
+                if live is None:
+                    live, first_ns = _begin(source, heard, config, topo, out.notes, speed > 0), m.stamp_ns
+                if speed > 0:
+                    ahead = (m.stamp_ns - first_ns) * 1e-9 / speed - (time.perf_counter() - began)
+                    time.sleep(max(ahead, 0.0))
+                if kept is not None:
+                    kept.see(m)
+                state = live.process(m, heard)
+                heard = []
+                out.states.append(state)
+                say(state)
+        except KeyboardInterrupt:
+            out.notes.append("stopped by hand: what came until then is mapped")
+        source.check()
+        if live is None:
+            raise InsufficientDataError("no scan in the recording (or in the part that was asked for)")
+        live.mapper.hear(heard)
+        live.mapper.skipped.update(source.skipped)
+        out.notes += source.notes()
+        if kept is not None and kept.broken:
+            out.notes.append(kept.broken)
+    out.seconds["play"] = time.perf_counter() - began
+    progress("finish", 0.0)
+    began = time.perf_counter()
+    out.solved = live.finish()
     out.seconds["finish"] = time.perf_counter() - began
     progress("finish", 1.0)
     return out
@@ -131,17 +127,17 @@ def _opened(
     if any(p.suffix == JOURNAL for p in paths):
         if len(paths) > 1 or span_s != WHOLE:
             raise UsageError(f"{JOURNAL}: one journal at a time, and the whole of it")
-        with closing(Journaled(paths[0])) as left:
-            yield _Source(
-                messages=(m for trunks, heard in left for m in (*heard, *(() if trunks is None else (trunks,)))),
-                find=left.find,
-                mount=left.mount,
-                chosen=left.chosen,
-                start_ns=left.start_ns,
-                skipped=Counter(),
-                notes=lambda: ["made of the journal of a run that was cut short"],
-                check=lambda: None,
-            )
+        left = Journaled(paths[0])
+        yield _Source(
+            messages=left.messages(),
+            find=left.find,
+            mount=left.mount,
+            chosen=left.chosen,
+            start_ns=left.start_ns,
+            skipped=Counter(),
+            notes=lambda: ["made of the journal of a run that was cut short", *_torn(left)],
+            check=lambda: None,
+        )
         return
     with Recording(paths, config.bags) as recording:
         yield _Source(
@@ -154,6 +150,10 @@ def _opened(
             notes=lambda: [*recording.notes, *recording.clocks.notes],
             check=lambda: refuse_damaged(recording, span_s != WHOLE),
         )
+
+
+def _torn(left: Journaled) -> list[str]:
+    return [f"{left.damaged} records of the journal are torn or damaged, and left out"] if left.damaged else []
 
 
 JOURNAL = ".journal"

@@ -1,15 +1,16 @@
-"""What a run brought so far, on disk while it is driven: a process that dies takes half a second of it along."""
+"""What a run brought so far, on disk while it is driven: a process that dies takes half a second of it along at most."""
 
 from __future__ import annotations
 
 import io
 import json
-import sqlite3
+import struct
 import time
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from urllib.parse import quote
+from typing import Any
 
 import numpy as np
 
@@ -18,9 +19,11 @@ from topograph.errors import InputError
 from topograph.geometry import Array
 
 Message = Odometry | Imu | Fix | Heading
-COMMIT_S = 0.5
-"""What is younger is lost with the process."""
-FORMAT = 1
+WAIT_S = 0.5
+"""Messages that wait for a scan longer are written without one."""
+MAGIC = b"topograph journal 1\n"
+HEADER = struct.Struct("<QI")
+"""Of a record: length and CRC-32 of its content."""
 COLUMNS: dict[type[Message], tuple[str, ...]] = {
     Odometry: ("child_frame", "odom_T_child", "twist"),
     Imu: ("frame", "gyro", "accel"),
@@ -31,11 +34,17 @@ OF_TRUNKS = ("p", "axis", "diameter", "cov", "height", "score", "kinds", "measur
 
 
 class Journal:
-    """Append scans' trunks and messages to an SQLite file; killed at any time, it is whole up to the last commit.
+    """Append scans' trunks and messages to a file, each batch whole at once: what was appended stays when the process is killed.
+
+    A file of records: length and CRC-32 of what follows, then one letter (`h` head as JSON, `b` batch as npz) and the content.
 
     Args:
         find: frame of a sensor -> its mounting (4, 4), or None where nobody knows.
         mount: kind and frame -> the mounting that the map takes, or None.
+        about: further facts for whoever finds it.
+
+    Attributes:
+        broken: why nothing more is written, or "": a full disk ends the journal, not the drive.
     """
 
     def __init__(
@@ -46,89 +55,97 @@ class Journal:
         chosen: dict[str, str],
         find: Callable[[str], Array | None],
         mount: Callable[[str, str], Array | None],
+        about: dict[str, str] | None = None,
     ) -> None:
         self.path, self._find, self._mount = path, find, mount
+        self.broken = ""
         self._frames: set[tuple[str, str]] = set()
-        self._known: dict[str, str] = {}
-        self._db = sqlite3.connect(path, isolation_level=None)
-        self._db.execute("PRAGMA journal_mode = WAL")
-        self._db.execute(
-            "PRAGMA synchronous = NORMAL"
-        )  # a dead process loses nothing that was committed; a dead machine may
-        self._db.execute("CREATE TABLE head (key TEXT PRIMARY KEY, value TEXT NOT NULL)")
-        self._db.execute("CREATE TABLE batch (n INTEGER PRIMARY KEY, data BLOB NOT NULL)")
-        self._db.execute("BEGIN")
-        self._say("format", FORMAT)
-        self._say("start_ns", start_ns)
-        self._say("chosen", chosen)
-        self._committed = -np.inf
+        self._known: dict[str, object] = {}
+        self._waiting: list[Message] = []
+        self._written = time.monotonic()
+        self._file = path.open("xb", buffering=0)
+        self._append(MAGIC)
+        self._say({"start_ns": start_ns, "chosen": chosen, "about": about or {}})
 
-    def add(self, trunks: Trunks | None, messages: Iterable[Message]) -> None:
-        """The messages since the last scan, then the scan's trunks in `base_link`."""
-        messages = list(messages)
-        for m in messages:
-            kind = {Odometry: "child", Imu: "imu", Fix: "fix", Heading: "heading"}[type(m)]
-            self._frames.add((kind, m.child_frame if isinstance(m, Odometry) else m.frame))
-        self._db.execute("INSERT INTO batch (data) VALUES (?)", (_packed(trunks, messages),))
-        if (now := time.monotonic()) - self._committed >= COMMIT_S:
-            self._commit()
-            self._committed = now
+    def hear(self, message: Message) -> None:
+        """A message; it is written with the next scan, or half a second later."""
+        self._waiting.append(message)
+        kind = {Odometry: "child", Imu: "imu", Fix: "fix", Heading: "heading"}[type(message)]
+        self._frames.add((kind, message.child_frame if isinstance(message, Odometry) else message.frame))
+        if time.monotonic() - self._written >= WAIT_S:
+            self.flush()
 
-    def close(self, *, keep: bool) -> None:
-        """The run has ended: its journal goes, or stays as one file."""
-        self._commit()
-        self._db.execute("COMMIT")
-        self._db.execute("PRAGMA journal_mode = DELETE")
-        self._db.close()
-        if not keep:
-            self.path.unlink(missing_ok=True)
+    def see(self, trunks: Trunks) -> None:
+        """A scan's trunks in `base_link`."""
+        self.flush(trunks)
 
-    def _commit(self) -> None:
+    def flush(self, trunks: Trunks | None = None) -> None:
+        """Write what waits."""
+        mounts: dict[str, object] = {}
         for kind, frame in self._frames:
-            self._say(f"find {frame}", _plain(self._find(frame)))
+            mounts[f"find {frame}"] = _plain(self._find(frame))
             if kind != "child":
-                self._say(f"mount {kind} {frame}", _plain(self._mount(kind, frame)))
-        self._db.execute("COMMIT")
-        self._db.execute("BEGIN")
+                mounts[f"mount {kind} {frame}"] = _plain(self._mount(kind, frame))
+        self._say(mounts)  # transforms may come, or change, on the way
+        if trunks is not None or self._waiting:
+            self._record(b"b" + _packed(trunks, self._waiting))
+            self._waiting = []
+        self._written = time.monotonic()
 
-    def _say(self, key: str, value: object) -> None:
-        text = json.dumps(value)
-        if self._known.get(key) != text:  # transforms may come, or change, on the way
-            self._db.execute("INSERT OR REPLACE INTO head VALUES (?, ?)", (key, text))
-            self._known[key] = text
+    def close(self) -> None:
+        """Nothing more comes; the file stays."""
+        if not self._file.closed:
+            self.flush()
+            self._file.close()
+
+    def _say(self, facts: dict[str, object]) -> None:
+        new = {k: v for k, v in facts.items() if k not in self._known or self._known[k] != v}
+        if new:
+            self._record(b"h" + json.dumps(new).encode())
+            self._known |= new
+
+    def _record(self, content: bytes) -> None:
+        self._append(HEADER.pack(len(content), zlib.crc32(content)) + content)
+
+    def _append(self, data: bytes) -> None:
+        if self.broken:
+            return
+        try:
+            rest = memoryview(data)
+            while len(rest):
+                rest = rest[self._file.write(rest) :]
+        except OSError as err:
+            self.broken = f"the journal ends early ({err.strerror}): {self.path}"
 
 
 class Journaled:
-    """A journal that was left behind, read.
+    """A journal that was left behind, read. A record that was torn or damaged is passed over.
 
     Attributes:
-        start_ns, chosen: as they were given.
+        start_ns, chosen, about: as they were given.
+        damaged: records that could not be read; complete after `messages` has run through.
 
     Raises:
-        InputError: not a journal, or of a newer program.
+        InputError: not a journal.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path, self.damaged = path, 0
+        self._head: dict[str, Any] = {}
         try:
             with path.open("rb") as f:
-                if f.read(15) != b"SQLite format 3":
-                    raise InputError(f"{path}: is no journal of `topograph live`")
-            self._db = sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro", uri=True)
-            self._head = {k: json.loads(v) for k, v in self._db.execute("SELECT key, value FROM head")}
-            self.start_ns, self.chosen = (
-                int(self._head["start_ns"]),
-                {str(k): str(v) for k, v in self._head["chosen"].items()},
-            )
-            newer = int(self._head["format"]) > FORMAT
+                if f.read(len(MAGIC)) != MAGIC:
+                    raise InputError(f"{path}: is no journal of this version of `topograph live`")
+            for content in self._records():
+                if content[:1] == b"h":
+                    self._head |= json.loads(content[1:])
+            self.start_ns = int(self._head["start_ns"])
+            self.chosen = {str(k): str(v) for k, v in self._head["chosen"].items()}
+            self.about = {str(k): str(v) for k, v in self._head["about"].items()}
         except OSError as err:
             raise InputError(f"{path}: {err.strerror}") from err
-        except (sqlite3.Error, ValueError, KeyError, TypeError, AttributeError) as err:
-            raise InputError(
-                f"{path}: is no journal of `topograph live`, or nothing of it was written ({err})"
-            ) from err
-        if newer:
-            raise InputError(f"{path}: written by a newer topograph; update this one")
+        except (ValueError, KeyError, TypeError, AttributeError) as err:
+            raise InputError(f"{path}: the head of the journal is damaged ({err})") from err
 
     def find(self, frame: str) -> Array | None:
         """Mounting (4, 4) of the sensor with that frame."""
@@ -138,21 +155,36 @@ class Journaled:
         """Mounting (4, 4) that the map takes for a kind of sensor with that frame."""
         return _matrix(self._head.get(f"mount {kind} {frame}"))
 
-    def __iter__(self) -> Iterator[tuple[Trunks | None, list[Message]]]:
-        """Scan by scan: the trunks, and the messages before them.
+    def messages(self) -> Iterator[Trunks | Message]:
+        """What came, in the order of its coming."""
+        self.damaged = 0
+        for content in self._records():
+            if content[:1] != b"b":
+                continue
+            try:
+                trunks, messages = _unpacked(content[1:])
+            except (ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile, EOFError):
+                self.damaged += 1
+                continue
+            yield from messages
+            if trunks is not None:
+                yield trunks
 
-        Raises:
-            InputError: a part of it is damaged.
-        """
-        try:
-            for (data,) in self._db.execute("SELECT data FROM batch ORDER BY n"):
-                yield _unpacked(data)
-        except (sqlite3.Error, ValueError, KeyError, TypeError, IndexError, zipfile.BadZipFile, EOFError) as err:
-            raise InputError(f"{self.path}: the journal is damaged ({err})") from err
-
-    def close(self) -> None:
-        """Give the file back."""
-        self._db.close()
+    def _records(self) -> Iterator[bytes]:
+        """Contents whose sums are right; lengths lead from one record to the next."""
+        with self.path.open("rb") as f:
+            end = f.seek(0, 2)
+            f.seek(len(MAGIC))
+            while len(header := f.read(HEADER.size)) == HEADER.size:
+                length, crc = HEADER.unpack(header)
+                if length > end - f.tell():  # torn, or a length that is none
+                    self.damaged += 1
+                    return
+                content = f.read(length)
+                if zlib.crc32(content) == crc:
+                    yield content
+                else:
+                    self.damaged += 1
 
 
 def _packed(trunks: Trunks | None, messages: Sequence[Message]) -> bytes:

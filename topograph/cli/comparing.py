@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import re
 import time
 from pathlib import Path
 from typing import Any
@@ -165,18 +166,16 @@ def _keep(folder: Path, c: Any, config: Any, **more: Any) -> None:
 
 def _by_fixes(words: tuple[str, ...]) -> int:
     """0: the truth is something else; 1: all fixes; N: every N-th."""
-    if len(words) != 1 or not words[0].startswith("fixes"):
+    if len(words) != 1 or not re.fullmatch(r"fixes(/[0-9]{1,6})?", words[0]):
         return 0
-    _, _, n = words[0].partition("/")
-    if words[0] == "fixes":
-        return 1
-    if not n.isdigit() or int(n) < 2:
+    n = int(words[0].partition("/")[2] or 1)
+    if n < 1 + ("/" in words[0]):
         raise UsageError(f"--truth {words[0]}: give fixes, or fixes/N with N from 2 on")
-    return int(n)
+    return n
 
 
 def _truths(words: tuple[str, ...], n: int) -> list[Any]:
-    if any(w.startswith("fixes") and not Path(w).exists() for w in words):
+    if any(re.fullmatch(r"fixes(/.*)?", part) and not Path(part).exists() for w in words for part in w.split("+")):
         raise UsageError("--truth fixes is for all runs: give it alone")
     found = [truth_of([Path(p) for p in w.split("+")]) for w in words]
     if not found:

@@ -1,7 +1,7 @@
 """All other formats, one table: suffix -> writer."""
 
-from topograph.exchange.geotiff import Underlay, read_underlay
+from topograph.exchange.geotiff import Underlay, check_picture, read_underlay
 from topograph.exchange.table import WRITERS, write
 from topograph.exchange.tum import read_tum, write_tum, write_wide_tum
 
-__all__ = ["WRITERS", "Underlay", "read_tum", "read_underlay", "write", "write_tum", "write_wide_tum"]
+__all__ = ["WRITERS", "Underlay", "check_picture", "read_tum", "read_underlay", "write", "write_tum", "write_wide_tum"]

@@ -246,7 +246,9 @@ class GraphMethod:
         T = from_xyz_rpy(px, py, self._tilt[0], leg.roll + self._tilt[1], leg.pitch + self._tilt[2], yaw)
         cov = np.zeros((6, 6))
         cov[np.ix_([3, 4, 2], [3, 4, 2])] = belief.cov
-        cov[np.ix_([5, 0, 1], [5, 0, 1])] = self._tilt_cov
+        turn = np.eye(3)  # roll and pitch are the robot's; the map's axes are turned from them by its heading
+        turn[1:, 1:] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+        cov[np.ix_([5, 0, 1], [5, 0, 1])] = turn @ self._tilt_cov @ turn.T
         cov[[0, 1], [0, 1]] += 0.01**2
         cov[[3, 4], [3, 4]] += self._slip.standing**2
         # What all trees of the map, or all grounds under them, have in common no number of sightings takes away.

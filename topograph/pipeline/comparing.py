@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from topograph.config import Config, over
-from topograph.errors import TopographError
+from topograph.errors import InsufficientDataError, TopographError
 from topograph.estimate.average import Rule
 from topograph.estimate.ekf import filtered_path
 from topograph.evaluate import Metric, Truth, WorldInMap, map_metrics, path_metrics, trunk_metrics, world_in_map
@@ -29,7 +29,7 @@ from topograph.evaluate.chapter5 import (
 from topograph.evaluate.comparison import BEST, OURS, WRITTEN, Comparison, Row, Track
 from topograph.evaluate.localization import localization_errors, localization_metrics
 from topograph.evaluate.outside import smfeval_metrics
-from topograph.exchange import Underlay, read_underlay
+from topograph.exchange import Underlay, check_picture, read_underlay
 from topograph.geometry import interpolate
 from topograph.localize import GraphMethod, Method, ThesisMethod
 from topograph.mapping import Progress, prepare, silent
@@ -77,6 +77,8 @@ def compare_runs(
         by_fixes: each run's own GNSS, filtered, is its truth (thesis 5.3): 1 all of it, N every N-th fix, which no map is then made with.
         image: a georeferenced picture that is drawn under the maps.
     """
+    if image is not None:
+        check_picture(image)
     out = Comparison(runs=_names(runs))
     w = _Work(out, list(truths), by_fixes == 1)
     configs = {OURS: config, WRITTEN: over(config, "thesis"), BEST: over(config, "thesis_best")}
@@ -96,6 +98,13 @@ def compare_runs(
         )
     if by_fixes:
         w.truths = [fixes_truth(with_fixes(w.heard["organised", r], by_fixes, True), config) for r in out.runs]
+        for r, t in zip(out.runs, w.truths, strict=True):
+            if t is None:
+                out.notes.append(f"{r}: no truth, too few of its fixes are usable")
+        if not any(t is not None for t in w.truths):
+            raise InsufficientDataError(
+                "--truth fixes: no run has enough usable fixes; give a smaller N, or another truth"
+            )
         if by_fixes > 1:
             w.heard = {k: with_fixes(h, by_fixes, False) for k, h in w.heard.items()}
         out.notes.append(BY_FIXES if by_fixes == 1 else BY_WITHHELD.format(n=by_fixes))
@@ -139,7 +148,11 @@ def _underlay(image: Path, topo: TopoMap, notes: list[str]) -> Underlay | None:
         notes.append(f"{image.name}: not drawn, the map is not georeferenced")
         return None
     seen = np.concatenate([topo.p[:, :2], topo.map_T_robot[:, :2, 3]])
-    return read_underlay(image, topo.datum, seen.min(axis=0) - 8.0, seen.max(axis=0) + 8.0)
+    found = read_underlay(image, topo.datum, seen.min(axis=0) - 8.0, seen.max(axis=0) + 8.0)
+    if not found.pixels[..., 3].any():
+        notes.append(f"{image.name}: shows nothing of where the map is")
+        return None
+    return found
 
 
 def fixes_truth(heard: Heard, config: Config) -> Truth | None:
@@ -375,8 +388,13 @@ def _world_or_note(w: _Work, map_name: str, truth: Truth) -> WorldInMap | None:
 
 def _world(w: _Work, map_name: str, truth: Truth) -> WorldInMap:
     """Georeferenced truths find into a georeferenced map by themselves; else the frame is that of the run that was mapped."""
-    if map_name in w.worlds and (truth.datum is None or w.out.maps[map_name].datum is None):
-        return w.worlds[map_name]
+    if truth.datum is None or w.out.maps[map_name].datum is None:
+        if map_name in w.worlds:
+            return w.worlds[map_name]
+        if truth is not w.truths[0] and not len(truth.trees):
+            raise InsufficientDataError(
+                "the map is local and the run that it was made of has no truth: nothing leads from the truth into it"
+            )
     return world_in_map(w.out.maps[map_name], truth)
 
 

@@ -14,6 +14,8 @@ GROUND_SIGMA = 0.04
 """What no view of a tree shows: grass, mounds and furrows smaller than the cells of the front end's ground, m."""
 OWN = 0.7
 """Share of the spread of a tree's grounds that they have in common; 0.5-1 tried on simulated seeds below 1000."""
+SPREAD, SIGHTINGS = 0.012, 4.0
+"""Spread of grounds that is there before any was compared, m per metre of range, and how many sightings it counts as."""
 
 
 def grounds(detections: Detections, tree: NDArray[np.int64], map_T_scan: Array, n: int) -> tuple[Array, Array]:
@@ -32,8 +34,12 @@ def grounds(detections: Detections, tree: NDArray[np.int64], map_T_scan: Array, 
     for j in np.flatnonzero(np.diff(ends)).tolist():
         mine = order[ends[j] : ends[j + 1]]
         z[j] = weighted_median(ground[mine], weight[mine])
-        spread = 1.48 * weighted_median(np.abs(ground[mine] - z[j]), weight[mine])
-        sigma[j] = np.hypot(GROUND_SIGMA, OWN * spread)
+        w = weight[mine]
+        count = w.sum() ** 2 / (w @ w)  # as many sightings of one weight
+        seen = 1.48 * weighted_median(np.abs(ground[mine] - z[j]), w)
+        usual = SPREAD / np.sqrt(w.mean())
+        spread = np.sqrt((SIGHTINGS * usual**2 + (count - 1.0) * seen**2) / (SIGHTINGS + count - 1.0))
+        sigma[j] = np.hypot(GROUND_SIGMA, (OWN + (1.0 - OWN) / np.sqrt(count)) * spread)
     return z, sigma
 
 

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import betaln, expit, logit
 from scipy.stats import beta
 
 from topograph.geometry import Array, inverse, transform
@@ -36,6 +37,8 @@ SHOWN_SINGLE, SHOWN_FORKED = (0.6, 25.0), (1.0, 1.8)
 branch; of forked ones any share, since one stem hides the other from some sides. Simulated olives, seeds below 1000."""
 SURELY = 0.3
 """Share beyond which a tree forks whatever the others do: posts and wires of a trellis come up to it."""
+LEAST_TOLD = 5.0
+"""Independent sightings of a tree before it counts in the run's share of forked ones."""
 USUAL_FORKS = (1.0, 9.0)
 """Trees' worth of forked and of single ones that a run's share of forked ones is drawn towards."""
 FORKED_LEAN = 0.13
@@ -106,7 +109,7 @@ def shapes(
     slope = slope - _seen_lean(slope, weight, away, order, ends) * away
     trust = d.believed / np.maximum(0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1]), 1e-6)
     places, slopes = _Views(n, VIEW_SIGMA), _Views(n, VIEW_LEAN)
-    forked = _forked_probability(_shares(d, order, ends))
+    forked = _forked_probability(_told(d, order, ends))
     for j in range(n):
         mine = order[ends[j] : ends[j + 1]]
         if not len(mine):
@@ -291,24 +294,29 @@ def _nearer(d: Detections, mine: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray(d.stems[mine[far <= np.median(far)]])
 
 
-def _shares(d: Detections, order: NDArray[np.int64], ends: NDArray[np.int64]) -> Array:
-    """Share (T,) of each tree's nearer sightings that told two stems apart; NaN for trees without sightings."""
-    return np.array(
-        [np.mean(_nearer(d, order[a:b]) > 1) if b > a else np.nan for a, b in pairwise(ends.tolist())]
-    ).reshape(-1)
+def _told(d: Detections, order: NDArray[np.int64], ends: NDArray[np.int64]) -> Array:
+    """(T, 2) of each tree's nearer sightings, how many told two stems apart and how many there were, as independent ones."""
+    out = np.zeros((len(ends) - 1, 2))
+    for j, (a, b) in enumerate(pairwise(ends.tolist())):
+        if b > a:
+            near = _nearer(d, order[a:b])
+            out[j] = np.sum(near > 1), len(near)
+    return ALIKE * out
 
 
-def _forked_probability(share: Array) -> Array:
-    """Probability (T,) that a tree forks, from the share of its sightings that say so, and how many trees of the run surely do.
+def _forked_probability(told: Array) -> Array:
+    """Probability (T,) that a tree forks, from how many of its sightings say so (T, 2), and how many trees of the run surely do: the share
+    that do is beta distributed, among single trunks and among forked ones.
 
     What looks like a branch in an orchard of single trunks is a stem among trees that mostly have two.
     """
-    x = np.clip(np.nan_to_num(share), 0.005, 0.95)
-    odds = beta.pdf(x, *SHOWN_FORKED) / beta.pdf(x, *SHOWN_SINGLE)
-    known = np.isfinite(share)
-    surely = np.sum(x[known] > SURELY) / beta.sf(SURELY, *SHOWN_FORKED)
+    k, n = told.T
+    (a, b), (c, e) = SHOWN_FORKED, SHOWN_SINGLE
+    log_odds = betaln(k + a, n - k + b) - betaln(a, b) - betaln(k + c, n - k + e) + betaln(c, e)
+    known = n >= LEAST_TOLD
+    surely = np.sum(k[known] > SURELY * n[known]) / beta.sf(SURELY, *SHOWN_FORKED)
     rate = min((USUAL_FORKS[0] + surely) / (sum(USUAL_FORKS) + known.sum()), 0.95)
-    return np.where(known, rate * odds / (rate * odds + 1.0 - rate), 0.0)
+    return np.asarray(np.where(n > 0, expit(log_odds + logit(rate)), 0.0))
 
 
 def _stems(d: Detections, mine: NDArray[np.int64]) -> int:

@@ -1,6 +1,8 @@
-"""The README's table of the comparison, made of a `metrics.json` of `topograph compare`:  python tools/readme_figures.py [--from METRICS] [--check]
+"""The README's tables of the comparison, made of what `topograph compare` and `topograph compare --suite` leave as `metrics.json`:
 
-Without --check the table is written between its marks; with it, exit 1 when a typed figure differs from what docs/compare.json says.
+    python tools/readme_figures.py [--from METRICS] [--suite METRICS] [--check]
+
+Without --check the tables are written between their marks; with it, exit 1 when a typed figure differs from what docs/compare.json and docs/suite.json say.
 """
 
 from __future__ import annotations
@@ -12,8 +14,21 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parents[1]
-README, KEPT = HERE / "README.md", HERE / "docs" / "compare.json"
+README, KEPT, SUITE = HERE / "README.md", HERE / "docs" / "compare.json", HERE / "docs" / "suite.json"
 BEGIN, END = "<!-- compare: made by tools/readme_figures.py -->", "<!-- end of compare -->"
+SUITE_BEGIN, SUITE_END = "<!-- suite: made by tools/readme_figures.py -->", "<!-- end of suite -->"
+RATIOS = (
+    ("map: tree error at 0.8 m", "C map, tree error at 0.8 m, mean: graph / thesis at its best"),
+    ("localization: distance error", "C, distance error mean: graph / thesis at its best"),
+    ("convergence: driven until the first pose", "convergence, convergence mean: graph / thesis at its best"),
+    ("on our map and trunks: distance error", "B, distance error mean: graph / thesis at its best"),
+)
+CHAINS = (
+    ("tree error", "C map", "tree error at 0.8 m, mean", "m"),
+    ("nodes within 1 m of a tree", "C map", "precision (1 m)", ""),
+    ("distance error", "C", "distance error mean", "m"),
+    ("starts that ended wrong, of 16", "convergence", "starts that ended wrong", ""),
+)
 
 ROWS = (
     ("nodes that are trees (within 2.5 m), all nodes", "C map", ("precision (2.5 m)", "nodes"), ""),
@@ -49,28 +64,56 @@ def table(figures: dict[str, float | None]) -> str:
     return "\n".join([*lines, "", f"On our detections, another estimator (tree error at 0.8 m): {ladder}."])
 
 
+def suite_table(figures: dict[str, float | None]) -> str:
+    """Ours over the thesis's, and each design by itself."""
+    lines = ["| graph / thesis at its best, whole chain | ratio | 95 % |", "|---|---|---|"]
+    for title, key in RATIOS:
+        ratio, low, high = (figures.get(f"ratios/{key}/{m}") for m in ("ratio", "95 % from", "95 % to"))
+        lines.append(f"| {title} | {number(ratio)} | {number(low)} to {number(high)} |")
+    designs = sorted({k.split("/")[0].partition(": ")[2] for k in figures if k.startswith("C map: ")})
+    names = NAMES[:2]
+    lines += ["", "| design | " + " | ".join(f"{c[0]}: {', '.join(names)}" for c in CHAINS) + " |", "|---|" + "---|" * len(CHAINS)]
+    for d in designs:
+        cells = [", ".join(shown(figures.get(f"{where}: {d}/{n}/{m}"), unit) for n in names) for _, where, m, unit in CHAINS]
+        lines.append(f"| {d} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def number(value: float | None) -> str:
+    return "–" if value is None or not math.isfinite(value) else f"{value:.2f}"
+
+
+def kept(source: Path, tables: tuple[str, ...]) -> str:
+    """The figures of some tables of a `metrics.json`, as text."""
+    found = json.loads(source.read_text())["metrics"]
+    figures = {m["key"]: m["value"] for m in found if m["key"].split("/")[0].partition(": ")[0] in tables}
+    return json.dumps(figures, indent=0) + "\n"
+
+
+def replaced(text: str, begin: str, end: str, new: str) -> str:
+    """`text` with what stands between two marks replaced."""
+    before, _, rest = text.partition(begin)
+    return f"{before}{begin}\n{new}\n{end}{rest.partition(end)[2]}"
+
+
 def main() -> int:
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("--from", dest="source", type=Path)
+    p.add_argument("--suite", type=Path)
     p.add_argument("--check", action="store_true")
     a = p.parse_args()
     if a.source is not None:
-        found = json.loads(a.source.read_text())["metrics"]
-        kept = {
-            m["key"]: m["value"]
-            for m in found
-            if m["key"].split("/")[0] in ("A", "B", "C", "C map", "convergence", "conditions")
-        }
-        KEPT.write_text(json.dumps(kept, indent=0) + "\n")
+        KEPT.write_text(kept(a.source, ("A", "B", "C", "C map", "convergence", "conditions")))
+    if a.suite is not None:
+        SUITE.write_text(kept(a.suite, ("C", "C map", "convergence", "ratios")))
     text = README.read_text()
-    before, _, rest = text.partition(BEGIN)
-    old, _, after = rest.partition(END)
-    new = f"\n{table(json.loads(KEPT.read_text()))}\n"
+    new = replaced(text, BEGIN, END, table(json.loads(KEPT.read_text())))
+    new = replaced(new, SUITE_BEGIN, SUITE_END, suite_table(json.loads(SUITE.read_text())))
     if a.check:
-        if old != new:
-            print("README.md does not say what docs/compare.json says: run python tools/readme_figures.py")
-        return int(old != new)
-    README.write_text(f"{before}{BEGIN}{new}{END}{after}")
+        if text != new:
+            print("README.md does not say what docs/compare.json and docs/suite.json say: run python tools/readme_figures.py")
+        return int(text != new)
+    README.write_text(new)
     return 0
 
 

@@ -72,9 +72,15 @@ def suite_table(figures: dict[str, float | None]) -> str:
         lines.append(f"| {title} | {number(ratio)} | {number(low)} to {number(high)} |")
     designs = sorted({k.split("/")[0].partition(": ")[2] for k in figures if k.startswith("C map: ")})
     names = NAMES[:2]
-    lines += ["", "| design | " + " | ".join(f"{c[0]}: {', '.join(names)}" for c in CHAINS) + " |", "|---|" + "---|" * len(CHAINS)]
+    lines += [
+        "",
+        "| design | " + " | ".join(f"{c[0]}: {', '.join(names)}" for c in CHAINS) + " |",
+        "|---|" + "---|" * len(CHAINS),
+    ]
     for d in designs:
-        cells = [", ".join(shown(figures.get(f"{where}: {d}/{n}/{m}"), unit) for n in names) for _, where, m, unit in CHAINS]
+        cells = [
+            ", ".join(shown(figures.get(f"{where}: {d}/{n}/{m}"), unit) for n in names) for _, where, m, unit in CHAINS
+        ]
         lines.append(f"| {d} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -111,7 +117,9 @@ def main() -> int:
     new = replaced(new, SUITE_BEGIN, SUITE_END, suite_table(json.loads(SUITE.read_text())))
     if a.check:
         if text != new:
-            print("README.md does not say what docs/compare.json and docs/suite.json say: run python tools/readme_figures.py")
+            print(
+                "README.md does not say what docs/compare.json and docs/suite.json say: run python tools/readme_figures.py"
+            )
         return int(text != new)
     README.write_text(new)
     return 0

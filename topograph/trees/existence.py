@@ -212,6 +212,10 @@ def _looks(map_T_scan: Array) -> NDArray[np.bool_]:
     return np.concatenate([[True], np.diff(at) > 0])
 
 
+LEAST_DUE = 12.0
+"""Sightings that the run's other trees would have had from where a place was looked at, before their lack says anything."""
+
+
 def _shown_often(
     scan: NDArray[np.int64], which: NDArray[np.int64], p: Array, seen: NDArray[np.bool_], hits: NDArray[np.int64],
     n: int, config: TreesConfig,
@@ -223,10 +227,15 @@ def _shown_often(
     total = np.bincount(cell[sure], minlength=360)
     shown = np.bincount(cell[sure], seen[sure].astype(float), minlength=360)
     chance = ((shown + 0.1) / (total + 1.0))[cell]
-    expected = (chance > 0.35) & ~_hidden(scan, far, bearing)
+    open_to = ~_hidden(scan, far, bearing)
+    expected = (chance > 0.35) & open_to
     asked = np.bincount(which[expected], minlength=n)
     found = np.bincount(which[expected & seen], minlength=n)
-    return np.asarray((found / np.maximum(asked, 1) >= config.min_ratio) | (asked < 4))
+    ok = (found / np.maximum(asked, 1) >= config.min_ratio) | (asked < 4)
+    # From places where trees are rarely seen, a run of many laps should have seen one now and then.
+    due = np.bincount(which[open_to], chance[open_to], n)
+    came = np.bincount(which[open_to & seen], minlength=n)
+    return np.asarray(ok & ((came >= config.min_ratio * due) | (due < LEAST_DUE)))
 
 
 def _hidden(scan: NDArray[np.int64], far: Array, bearing: Array) -> NDArray[np.bool_]:

@@ -43,11 +43,17 @@ class Pass:
     trunk_scale: float = 1.0
     fix_scale: float = 1.0
     alike: float = 1.0
+    height: float = 100.0
 
 
 RELEARNT, STALE = 4, 0.6
 """Under Huber, wrong fixes bend the path, and what they bend is learnt as noise of the trunks. Where the residuals of the last
 pass shrink below this share of the noise, it is learnt again, at most so often."""
+
+
+QUICK_HEIGHT = 0.3
+"""Sigma of the trees' heights about their first sighting in quick passes, m. Recorded detections do not tell where on the trunk they lie: left
+free, the height takes up what the range is off by, in steps of metres that Gauss-Newton overshoots."""
 
 
 def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False, patient: bool = False) -> Estimate:
@@ -82,7 +88,7 @@ def _solve(problem: Problem, config: EstimateConfig, *, quick: bool, patient: bo
     most = config.quick_sightings if quick else config.most_sightings
     problem = replace(problem, sightings=_nearest(problem.sightings, most))
     values = _values(problem, poses, trees, inert)
-    first = Pass(huber, huber, 0.05 if quick else 0.0)
+    first = Pass(huber, huber, 0.05, height=QUICK_HEIGHT) if quick else Pass(huber, huber, 0.0)
     steps, tolerance = (3 * config.iterations, 1e-6)
     if quick:
         steps, tolerance = (3 * config.iterations, 1e-5) if patient else (10, 1e-3)
@@ -172,7 +178,7 @@ def factors_of(
         ("link", _links(problem)),
         ("heading", _headings(problem, config)),
         ("trunk", _trunks(problem, p)),
-        ("tree", _tree_priors(problem)),
+        ("tree", _tree_priors(problem, p.height)),
     )
     for kind, part in parts:  # generators: what is left out has not begun
         if kind not in without:
@@ -207,9 +213,9 @@ def _trunks(problem: Problem, p: Pass) -> Iterator[Any]:
     yield from factors.trunks(*keys, s.p, p.trunk_scale**2 * s.cov, p.trunk)
 
 
-def _tree_priors(problem: Problem) -> Iterator[Any]:
+def _tree_priors(problem: Problem, height: float) -> Iterator[Any]:
     """Keep every tree in the system even when a loss has given up on all its sightings."""
-    wide = factors.sigmas([100.0] * 3)
+    wide = factors.sigmas([100.0, 100.0, height])
     s, names = problem.sightings, problem.names()
     if problem.known is not None:
         k = problem.known

@@ -41,8 +41,8 @@ LARGE = 2000
 """Variables from which nested dissection orders them better than minimum degree: measured on runs of ten minutes with an IMU, half the
 time."""
 NEAR = 1e-2
-"""A Gauss-Newton step that raises the error by less than this share, after others that lowered it, has converged: robust losses are not
-quadratic, and the last steps go to and fro."""
+"""A Gauss-Newton step that raises the error by less than this share, or no share of which lowers it after the one before had gained less, has
+converged: robust losses are not quadratic, and the last steps go to and fro."""
 
 
 def optimised(graph: Any, values: Any, iterations: int, tolerance: float = 1e-5) -> Any:
@@ -69,22 +69,39 @@ def ordering_of(graph: Any, variables: int) -> Any:
 
 def _optimised(graph: Any, values: Any, iterations: int, tolerance: float) -> Any:
     ordering = ordering_of(graph, values.size())
-    error = graph.error(values)
+    error, gain = graph.error(values), math.inf
     for k in range(iterations):
         try:
-            moved = values.retract(graph.linearize(values).optimize(ordering))
-            now = graph.error(moved)
+            now, moved = _step(graph, values, graph.linearize(values).optimize(ordering), error)
         except RuntimeError:  # a variable that no factor holds here: damping may carry it to where one does
             now, moved = math.inf, values
         if not now <= error:  # NaN too
-            if k > 0 and now < (1.0 + NEAR) * error:
+            if k > 0 and (now < (1.0 + NEAR) * error or gain < NEAR * error):
                 return values
             return _levenberg_marquardt(graph, values, ordering, iterations - k, tolerance)
-        converged = error - now < tolerance * error
+        gain = error - now
+        converged = gain < tolerance * error
         values, error = moved, now
         if converged:
             break
     return values
+
+
+SHARES = (1.0, 0.5, 0.25)
+"""Of a Gauss-Newton step that are tried: robust losses and ranges of what lies near are not quadratic, and a whole step may go too far."""
+
+
+def _step(graph: Any, values: Any, delta: Any, error: float) -> tuple[float, Any]:
+    """Error and values after the largest share of a step that lowers the error, or after the whole step where none does."""
+    whole: tuple[float, Any] | None = None
+    for share in SHARES:
+        moved = values.retract(delta if share == 1.0 else delta.scale(share))
+        now = graph.error(moved)
+        whole = whole or (now, moved)
+        if now <= error:
+            return now, moved
+    assert whole is not None
+    return whole
 
 
 def _levenberg_marquardt(graph: Any, values: Any, ordering: Any, iterations: int, tolerance: float) -> Any:

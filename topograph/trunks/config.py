@@ -46,5 +46,5 @@ class TrunksConfig:
     score: str = ""
     recorded_sigma: Positive = 0.05
     recorded_growth: NonNegative = 0.01
-    recorded_along: Positive = 1.0
+    recorded_along: Positive = 5.0
     recorded_reach: Positive = 40.0

@@ -347,3 +347,20 @@ def test_ten_writers_at_once(tmp_path: Path) -> None:
     with store.locked(path):
         store.save(make(3), path)
     assert [p.name for p in tmp_path.iterdir()] == ["m.gpkg"]
+
+
+def test_an_ellipse_holds_what_the_covariance_says() -> None:
+    """Its larger half axis lies along the direction that is known worst, and 95 % of what is drawn from the covariance falls into it."""
+    t = TopoMap.of_points(np.zeros((1, 2)))
+    a = 0.7
+    turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
+    cov = np.zeros((1, 3, 3))
+    cov[0, :2, :2] = turn @ np.diag([0.3**2, 0.1**2]) @ turn.T
+    cov[0, 2, 2] = 1.0
+    radii, angle = replace(t, cov=cov).ellipses()
+    assert np.isclose(np.tan(angle[0]), np.tan(a))
+    drawn = np.random.default_rng(2).multivariate_normal([0, 0], cov[0, :2, :2], 20000)
+    c, s = np.cos(angle[0]), np.sin(angle[0])
+    own = drawn @ np.array([[c, -s], [s, c]])
+    assert np.isclose((np.sum((own / radii[0]) ** 2, axis=1) < 1).mean(), 0.95, atol=0.01)
+    assert np.isnan(replace(t, cov=np.full((1, 3, 3), np.nan)).ellipses()[1]).all()

@@ -47,19 +47,18 @@ def map_figure(topo: TopoMap, true_trees: Array | None = None, title: str = "") 
         ax.plot(*topo.map_T_robot[:, :2, 3].T, color=PATH, lw=1.0, zorder=2, label="path")
     if true_trees is not None:
         ax.plot(*true_trees[:, :2].T, "+", color=TRUE, ms=9, mew=1.2, zorder=4, label="truth")
+    radii, angle = topo.ellipses()
     for i in range(len(topo)):
         d = topo.diameter[i] if np.isfinite(topo.diameter[i]) else 0.2
         ax.add_patch(Circle(tuple(topo.p[i, :2]), max(0.5 * d, 0.1), color=TREE, zorder=3))
         if np.isfinite(topo.cov[i]).all():
-            values, vectors = np.linalg.eigh(topo.cov[i, :2, :2])
-            size = 2 * 10 * np.sqrt(5.991 * np.maximum(values, 0))
-            angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
+            size = 2 * 10 * radii[i]
             ax.add_patch(
                 Ellipse(
                     tuple(topo.p[i, :2]),
-                    size[1],
                     size[0],
-                    angle=angle,
+                    size[1],
+                    angle=np.degrees(angle[i]),
                     fill=False,
                     color=TREE,
                     lw=0.6,

@@ -13,7 +13,7 @@ import numpy as np
 from topograph.evaluate import Metric
 from topograph.geometry import Array
 from topograph.report.record import write_text
-from topograph.topomap import KINDS, TopoMap
+from topograph.topomap import CHI2_95, KINDS, TopoMap
 
 _STYLE = """
 :root{color-scheme:light dark;--ink:#1d2420;--soft:#5c6a61;--line:#d8dfda;--card:#fff;--page:#f5f7f5;--tree:#1b7837}
@@ -123,19 +123,14 @@ def show(m: Metric) -> str:
 def _map_data(topo: TopoMap, true_trees: Array | None) -> dict[str, object]:
     trees = []
     geodetic = topo.geodetic()
+    radii, angle = topo.ellipses()
     for i in range(len(topo)):
         d = float(topo.diameter[i]) if np.isfinite(topo.diameter[i]) else 0.2
         ellipse = None
         sigma = ""
         if np.isfinite(topo.cov[i]).all():
-            values, vectors = np.linalg.eigh(topo.cov[i, :2, :2])
-            rx, ry = np.sqrt(5.991 * np.maximum(values[::-1], 0))
-            ellipse = [
-                round(float(rx), 5),
-                round(float(ry), 5),
-                round(float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))), 1),
-            ]
-            sigma = f", σ {100 * np.sqrt(max(values)):.1f} cm"
+            ellipse = [*np.round(radii[i], 5).tolist(), round(float(np.degrees(angle[i])), 1)]
+            sigma = f", σ {100 * radii[i, 0] / np.sqrt(CHI2_95):.1f} cm"
         place = "" if topo.datum is None else f", {geodetic[i, 0]:.7f}°, {geodetic[i, 1]:.7f}°"
         row = "" if topo.row[i] < 0 else f", row {topo.row[i]}"
         text = f"{KINDS[int(topo.kind[i])]} {topo.ids[i]}: Ø {100 * d:.0f} cm, {topo.sightings[i]} sightings{sigma}{row}{place}"

@@ -23,7 +23,6 @@ from topograph.report.record import write_text
 from topograph.report.templates import render
 from topograph.topomap import TopoMap
 
-CHI2_95 = 5.991
 MOST_CLOUD_BYTES = 3_000_000
 """Of all clouds in a self-contained page; they are thinned alike until they fit."""
 STATES = ("searching", "ambiguous", "tracking", "degraded", "lost")
@@ -77,13 +76,7 @@ def summary(topo: TopoMap) -> str:
 def map_data(topo: TopoMap, *, clouds: bool) -> dict[str, Any]:
     """What the script draws: arrays as base64 of little-endian numbers."""
     n = len(topo)
-    a, b, turn = np.zeros(n), np.zeros(n), np.zeros(n)
-    known = np.isfinite(topo.cov[:, :2, :2]).all(axis=(1, 2))
-    if known.any():
-        values, vectors = np.linalg.eigh(topo.cov[known, :2, :2])
-        radii = np.sqrt(CHI2_95 * np.maximum(values, 0.0))
-        a[known], b[known] = radii[:, 1], radii[:, 0]
-        turn[known] = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+    radii, angle = (np.nan_to_num(v) for v in topo.ellipses())
     seen = np.zeros((len(topo.sessions), n), np.int64)
     if len(topo.seen):
         np.add.at(seen, (topo.seen.session, topo.seen.tree), topo.seen.count)
@@ -95,7 +88,7 @@ def map_data(topo: TopoMap, *, clouds: bool) -> dict[str, Any]:
         "trees": {
             **{k: _f4(topo.p[:, i]) for i, k in enumerate("xyz")},
             **{f"a{k}": _f4(topo.axis[:, i]) for i, k in enumerate("xyz")},
-            "id": topo.ids.tolist(), "d": _f4(np.nan_to_num(topo.diameter)), "a": _f4(a), "b": _f4(b), "turn": _f4(turn),
+            "id": topo.ids.tolist(), "d": _f4(np.nan_to_num(topo.diameter)), "a": _f4(radii[:, 0]), "b": _f4(radii[:, 1]), "turn": _f4(angle),
             "kind": _packed(topo.kind.astype("u1"), "u1"), "missing": _packed(np.array([s == "missing" for s in topo.state], "u1"), "u1"),
             "stems": topo.stems.tolist(), "sightings": topo.sightings.tolist(), "place": list(topo.place),
             "chance": _f4(np.nan_to_num(topo.kind_probability, nan=-1.0)), "sessions": _packed(bits.astype("<i4"), "i4"),

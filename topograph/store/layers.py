@@ -13,8 +13,6 @@ from topograph.store.schema import FEATURES, RTREE_TRIGGERS, geometry, lon_lat, 
 from topograph.store.styles import STYLES
 from topograph.topomap import TopoMap
 
-CHI2_95 = 5.991
-"""95 % of a chi-square with two degrees of freedom."""
 CORNERS = 24
 """Of the polygon that stands for an ellipse."""
 
@@ -44,15 +42,14 @@ def _path_lines(c: sqlite3.Connection, t: TopoMap, srs: int) -> None:
 
 def _ellipses(c: sqlite3.Connection, t: TopoMap, srs: int) -> None:
     """95 % of each tree's position, true to scale."""
-    known = np.flatnonzero(np.isfinite(t.cov).all(axis=(1, 2)))
+    radii, angle = t.ellipses()
     rows: list[tuple[int, bytes, int, float, float]] = []
-    for i in known.tolist():
-        values, vectors = np.linalg.eigh(t.cov[i, :2, :2])
-        radii = np.sqrt(CHI2_95 * np.maximum(values, 0.0))
+    for i in np.flatnonzero(np.isfinite(angle)).tolist():
         ring = np.tile(t.p[i], (CORNERS + 1, 1))
-        ring[:, :2] += _circle() * radii @ vectors.T
+        cos, sin = np.cos(angle[i]), np.sin(angle[i])
+        ring[:, :2] += _circle() * radii[i] @ np.array([[cos, sin], [-sin, cos]])
         world = ring if t.datum is None else lon_lat(t.datum, ring)
-        rows.append((len(rows) + 1, polygon(world, srs), int(t.ids[i]), float(radii[1]), float(radii[0])))
+        rows.append((len(rows) + 1, polygon(world, srs), int(t.ids[i]), float(radii[i, 0]), float(radii[i, 1])))
     c.executemany("INSERT INTO ellipses VALUES (?,?,?,?,?)", rows)
 
 

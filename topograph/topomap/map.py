@@ -15,6 +15,10 @@ from topograph.trunks.score import KINDS, OTHER, TREE
 __all__ = ["KINDS", "OTHER", "TREE", "TopoMap", "Viewpoint"]
 
 
+CHI2_95 = 5.991
+"""95 % of a chi-square with two degrees of freedom."""
+
+
 @dataclass(frozen=True, slots=True)
 class Viewpoint:
     """What node `tree` (row of the map's arrays) looks like from `direction` (3,), unit, node to robot, map frame.
@@ -126,6 +130,17 @@ class TopoMap:
     def place(self) -> list[str]:
         """Address of each tree: block, row, and number along the row."""
         return places_of(self.p[:, :2], self.block, self.row, self.is_tree)
+
+    def ellipses(self) -> tuple[Array, Array]:
+        """What holds 95 % of each tree's position: half axes (T, 2), the larger first, m, and the larger one's angle from east (T,), rad; NaN
+        where the covariance is not known.
+        """
+        radii, angle = np.full((len(self), 2), np.nan), np.full(len(self), np.nan)
+        known = np.isfinite(self.cov[:, :2, :2]).all(axis=(1, 2))
+        values, vectors = np.linalg.eigh(self.cov[known, :2, :2])
+        radii[known] = np.sqrt(CHI2_95 * np.maximum(values[:, ::-1], 0.0))
+        angle[known] = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+        return radii, angle
 
     def trees(self) -> TopoMap:
         """The map without its landmarks that are no trees; itself where there are none."""

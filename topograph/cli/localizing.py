@@ -92,12 +92,11 @@ def localize(
             run.exploded = other.exploded
         fixes = run.fixes
         poses = np.array([f.map_T_robot for f in fixes]).reshape(-1, 4, 4)
-        write_tum(folder / "localization.tum", np.array([f.stamp_ns for f in fixes], np.int64), poses)
+        stamps = np.array([f.stamp_ns for f in fixes], np.int64)
+        write_tum(folder / "localization.tum", stamps, poses)
         if len(fixes) and all(np.isfinite(f.cov).all() for f in fixes):
             cov = tangent_cov(poses, np.array([f.cov for f in fixes]))
-            write_wide_tum(
-                folder / "localization_wide.tum", np.array([f.stamp_ns for f in fixes], np.int64), poses, cov
-            )
+            write_wide_tum(folder / "localization_wide.tum", stamps, poses, cov)
         write_tum(folder / "smoothed.tum", *run.smoothed)
         write_text(folder / "localization.csv", _csv(run.reports))
         write_text(folder / "hypotheses.csv", _hypotheses(run.reports))

@@ -34,8 +34,8 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Pass:
-    """Losses and noise of one solve: least deviation of a fix (m), factors on the noise of trunks and fixes, and the
-    part of the trunks' that the likeness of neighbours makes."""
+    """Losses and noise of one solve: least deviation of a fix (m), factors on the noise of trunks and fixes, the
+    part of the trunks' that the likeness of neighbours makes, and the deviation of the trees' heights about where they begin (m)."""
 
     trunk: Kernel
     fix: Kernel

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from topograph.geometry import Array, inverse, transform
 from topograph.trees.detections import SECTORS, Detections
+from topograph.trees.robust import weighted_median
 from topograph.trees.screen import parts_apart
 from topograph.trees.tracks import TreesConfig
 from topograph.trunks.score import KIND_PRIOR, OTHER, TREE
@@ -132,11 +133,7 @@ def _weight(d: Detections, rows: NDArray[np.bool_]) -> Array:
 
 def _usual(score: Array, hits: NDArray[np.int64]) -> float:
     """Median score, by sightings: false trees are many, but seldom seen."""
-    if not len(score):
-        return 0.0
-    order = np.argsort(score)
-    total = np.cumsum(hits[order])
-    return float(score[order[np.searchsorted(total, 0.5 * total[-1])]])
+    return weighted_median(score, hits) if len(score) else 0.0
 
 
 def _pairs(

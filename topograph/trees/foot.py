@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from topograph.geometry import Array, transform
 from topograph.trees.detections import Detections
+from topograph.trees.robust import weighted_median
 
 NEAR = 3.0
 """Range within which a sweep's ground is as good as it gets, m: beyond, beams graze the grass, and its error grows as the range."""
@@ -41,10 +42,3 @@ def grounds(detections: Detections, tree: NDArray[np.int64], map_T_scan: Array, 
         spread = np.sqrt((SIGHTINGS * usual**2 + (count - 1.0) * seen**2) / (SIGHTINGS + count - 1.0))
         sigma[j] = np.hypot(GROUND_SIGMA, (OWN + (1.0 - OWN) / np.sqrt(count)) * spread)
     return z, sigma
-
-
-def weighted_median(x: Array, weight: Array) -> float:
-    """Where half of the `weight` (M,) of `x` (M,) lies below."""
-    order = np.argsort(x)
-    total = np.cumsum(weight[order])
-    return float(x[order][np.searchsorted(total, 0.5 * total[-1])])

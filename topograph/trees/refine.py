@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from topograph.geometry import Array
 from topograph.trees.loops import TrackTable
+from topograph.trees.robust import weighted_median
 from topograph.trees.tracks import TreesConfig
 from topograph.trunks.fit import NOT_ONE
 
@@ -71,16 +72,10 @@ def _leave(
         if len(group) < 2:
             continue
         # Weighted median: a wrong track must not drag the tree towards itself.
-        centre = np.array([_weighted_median(place[group, k], hits[group]) for k in range(2)])
+        centre = np.array([weighted_median(place[group, k], hits[group]) for k in range(2)])
         d = np.linalg.norm(place[group] - centre, axis=1)
         bound = np.sqrt(config.gate * (sigma[group] ** 2 + 2 * config.floor**2))
         for g in group[d > np.maximum(bound, patience)]:
             tree[g] = fresh
             fresh += 1
     return tree
-
-
-def _weighted_median(x: Array, w: NDArray[np.int64]) -> float:
-    order = np.argsort(x)
-    total = np.cumsum(w[order])
-    return float(x[order][np.searchsorted(total, 0.5 * total[-1])])

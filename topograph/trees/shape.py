@@ -12,7 +12,7 @@ from scipy.stats import beta
 
 from topograph.geometry import Array, inverse, transform
 from topograph.trees.detections import Detections
-from topograph.trees.foot import weighted_median
+from topograph.trees.robust import weighted_median
 
 LEAN_PRIOR = 0.12
 """Sigma of a trunk's lean from the vertical, rad (per axis)."""

@@ -113,8 +113,8 @@ def test_fixes_that_disagree_for_half_of_a_run_are_said(share: float, said: bool
     p = run(5)
     away = np.where(np.arange(len(p.fixes.keyframe)) < share * len(p.fixes.keyframe), 3.0, 0.0)
     e = Estimate(
-        p.stamps_ns, p.start if p.start is not None else p.odom_T_robot, np.zeros((0, 3)), np.zeros((0, 3, 3)), None, np.eye(3),
-        np.zeros(0, np.int64), np.zeros(0),
+        stamps_ns=p.stamps_ns, map_T_robot=p.start if p.start is not None else p.odom_T_robot, trees=np.zeros((0, 3)),
+        tree_cov=np.zeros((0, 3, 3)), joint=None, datum_cov=np.eye(3), tree=np.zeros(0, np.int64), weights=np.zeros(0),
     )  # fmt: skip
     z = p.fixes.map_p_antenna + away[:, None] * [1.0, 0.0, 0.0]
     found = list(audit.fixes(replace(p, fixes=replace(p.fixes, map_p_antenna=z)), e))

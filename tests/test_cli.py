@@ -63,8 +63,11 @@ def test_map_of_a_run(tmp_path: Path, detections_run: tuple[Path, Truth]) -> Non
     stamps, poses = read_tum(tmp_path / "path.tum")
     assert len(stamps) == len(poses) > 50
     page = (tmp_path / "report.html").read_text()
-    assert "http://" not in page.replace("http://www.w3.org/2000/svg", "")
+    assert "http://" not in page
     assert "https://" not in page
+    assert page.index("<b>sound</b>") < page.index("<table")
+    assert "Residuals over time" in page
+    assert (tmp_path / "map.html").exists() == ('href="map.html"' in page)
     assert load(tmp_path / "config.yaml") == Config()
     for name in ("trees.geojson", "trees.csv", "path.tum"):
         assert call("export", tmp_path / "m.gpkg", tmp_path / ("x" + name)).exit_code == 0

@@ -196,9 +196,10 @@ def save_results(
     if old is not None:
         topo = pipeline.extend(old, topo, solved, config)
     metrics = pipeline.residual_metrics(solved)
-    figures, true_trees = {}, None
+    figures: dict[str, bytes] = {}
+    true_trees = None
+    e = solved.estimate
     if true is not None:
-        e = solved.estimate
         metrics = truth_metrics(topo, e.stamps_ns, e.map_T_robot, true) + metrics
         true_trees = world_in_map(topo, true).points(true.trees) if len(true.trees) else None
         error = tree_errors(topo, true)[2] if len(true.trees) else np.zeros((0, 3))
@@ -209,8 +210,10 @@ def save_results(
     if len(topo):
         picture = report.map_figure(topo, true_trees)
         (folder / "map.png").write_bytes(picture)
-    if solved.estimate.residuals:
-        figures["Residuals by factor"] = report.residual_figure(solved.estimate.residuals)
+        figures = {"Map": picture, **figures}
+    if e.residuals:
+        figures["Residuals by factor"] = report.residual_figure(e.residuals)
+        figures["Residuals over time"] = report.residual_time_figure(e.residuals, e.residual_ns)
         (folder / "residuals.png").write_bytes(figures["Residuals by factor"])
     seconds = {**solved.seconds, "map and report": time.perf_counter() - began}
     write_text(folder / "config.yaml", text)
@@ -219,7 +222,6 @@ def save_results(
         "from": ", ".join(p.name for p in bags),
         "recorded": f"{solved.run.duration_s:.0f} s",
         "topograph": __version__,
-        "audit": verdict.word,
     }
     if solved.problem.n_trees and verdict.word != "refused":
         store.save(topo, target)
@@ -228,15 +230,21 @@ def save_results(
         topics=solved.run.chosen, announced=solved.run.announced, scales=solved.estimate.scales, verdict=verdict.record(),
         offsets=[{"name": o.name, "value": o.value.tolist(), "sigma": o.sigma.tolist(), "gain": o.gain} for o in solved.estimate.offsets],
     )  # fmt: skip
-    said = [f"{verdict.word}: {r}" for r in verdict.reasons] or [
-        "sound: clocks, mountings, wheels, fixes and trunks agree"
-    ]
-    report.write_page(
-        folder / "report.html", f"Map of {', '.join(p.name for p in bags)}", topo, metrics, figures, solved.run.skipped,
-        [*said, *notes], facts, true_trees,
-    )  # fmt: skip
+    title = f"Map of {', '.join(p.name for p in bags)}"
+    trees, others = int(topo.is_tree.sum()), int((~topo.is_tree).sum())
+    count = f"{trees} trees" + (f" and {others} posts" if others else "")
+    sentence = {
+        "sound": f"– {count}; clocks, mountings, wheels, fixes and trunks agree.",
+        "doubtful": f"– {count}; the map is saved, look at what the audit found:",
+        "refused": "– no map was saved; the path is in path.tum. The audit found:",
+    }[verdict.word]
+    report.Page(
+        title=title, word=verdict.word, sentence=sentence, findings=verdict.findings, facts=facts, metrics=metrics, figures=figures,
+        notes=notes, skipped=solved.run.skipped, walk=("map.html", "Walk through the map") if len(topo) else None,
+    ).write(folder / "report.html")  # fmt: skip
     if len(topo):
-        write_viewer(folder / "map.html", topo, f"Map of {', '.join(p.name for p in bags)}", notes=said[:1])
+        said = [f"{verdict.word}: {r}" for r in verdict.reasons]
+        write_viewer(folder / "map.html", topo, title, notes=said[:1])
     progress("map", 1.0)
     return topo, verdict
 

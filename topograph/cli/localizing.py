@@ -56,7 +56,7 @@ def localize(
     from topograph.evaluate.metrics import Metric
     from topograph.exchange import write_wide_tum
     from topograph.geometry import interpolate, tangent_cov
-    from topograph.report import localization_error_figure, localization_figure, write_json, write_page
+    from topograph.report import Page, localization_error_figure, localization_figure, write_json
     from topograph.report.record import write_text
     from topograph.report.viewer import localization_data, write_viewer
 
@@ -123,10 +123,12 @@ def localize(
             "recorded": f"{run.duration_s:.0f} s",
             "topograph": __version__,
         }
-        write_page(
-            folder / "report.html", f"Localization of {', '.join(p.name for p in bags)}", topo, metrics, figures, run.skipped,
-            notes, facts,
-        )  # fmt: skip
+        word, _, rest = said.partition(" ")
+        Page(
+            title=f"Localization of {', '.join(p.name for p in bags)}", word=word.rstrip(":"), sentence=rest, facts=facts, metrics=metrics,
+            figures=figures, notes=[n for n in notes if n is not said], skipped=run.skipped,
+            walk=("replay.html", "Replay it on the map"),
+        ).write(folder / "report.html")  # fmt: skip
         true_xy = None
         if true is not None and world is not None and len(true.stamps_ns):
             stamps = np.array([r.stamp_ns for r in run.reports], np.int64)

@@ -67,8 +67,9 @@ def solve(problem: Problem, config: AverageConfig, path: Array | None = None) ->
     keep = hits >= config.least
     name = np.where(keep, np.cumsum(keep) - 1, -1)
     return Estimate(
-        problem.stamps_ns, path, nodes[keep], np.full((int(keep.sum()), 3, 3), np.nan), None, np.full((3, 3), np.nan),
-        np.where(tree >= 0, name[tree], -1) if len(nodes) else tree, np.ones(0), {}, {}, time.perf_counter() - began,
+        stamps_ns=problem.stamps_ns, map_T_robot=path, trees=nodes[keep], tree_cov=np.full((int(keep.sum()), 3, 3), np.nan),
+        joint=None, datum_cov=np.full((3, 3), np.nan), tree=np.where(tree >= 0, name[tree], -1) if len(nodes) else tree,
+        weights=np.ones(0), seconds=time.perf_counter() - began,
     )  # fmt: skip
 
 

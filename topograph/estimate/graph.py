@@ -24,7 +24,7 @@ from topograph.estimate.inertia import Inertia, inertia
 from topograph.estimate.initial import initial_path, yaw_of_direction
 from topograph.estimate.problem import Estimate, EstimateConfig, Offset, Problem
 from topograph.estimate.solver import optimised, ordering_of, with_big_stack
-from topograph.geometry import Array, inverse, log, transform, wrap
+from topograph.geometry import Array, Stamps, inverse, log, transform, wrap
 from topograph.trees import Sightings
 
 X, V, B, L, C = (gtsam.symbol(c, 0) for c in "xvblc")
@@ -450,9 +450,23 @@ def _estimate(problem: Problem, config: EstimateConfig, values: Any, p: Pass, li
     e = _trunk_residuals(problem, values, p.trunk_scale)
     residuals = {"trunk": e.ravel(), **_other_residuals(problem, values, p, config)}
     return Estimate(
-        problem.stamps_ns, poses, trees, tree_cov, joint, datum_cov, np.zeros(0, np.int64),
-        p.trunk.weight(np.linalg.norm(e, axis=1)), residuals, {"trunk": p.trunk_scale, "fix": p.fix_scale, "trunks alike": p.alike}, seconds,
+        stamps_ns=problem.stamps_ns, map_T_robot=poses, trees=trees, tree_cov=tree_cov, joint=joint, datum_cov=datum_cov,
+        tree=np.zeros(0, np.int64), weights=p.trunk.weight(np.linalg.norm(e, axis=1)), residuals=residuals,
+        residual_ns=_residual_stamps(problem, residuals), seconds=seconds,
+        scales={"trunk": p.trunk_scale, "fix": p.fix_scale, "trunks alike": p.alike},
     )  # fmt: skip
+
+
+def _residual_stamps(problem: Problem, residuals: dict[str, Array]) -> dict[str, Stamps]:
+    """Factor type -> the keyframe's stamp of each residual; a step's is that of its end."""
+    steps = np.arange(1, len(problem.stamps_ns))
+    keyframe = {
+        "trunk": problem.sightings.keyframe, "odometry": steps, "turn": steps, "fix": problem.fixes.keyframe, "heading": problem.headings.keyframe,
+    }  # fmt: skip
+    return {
+        name: np.repeat(problem.stamps_ns[keyframe[name]], len(r) // max(len(keyframe[name]), 1))
+        for name, r in residuals.items()
+    }
 
 
 def _other_residuals(problem: Problem, values: Any, p: Pass, config: EstimateConfig) -> dict[str, Array]:

@@ -163,7 +163,7 @@ class Offset:
     gain: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
     """Path, trees and what is known of their errors.
 
@@ -175,7 +175,7 @@ class Estimate:
         datum_cov: (3, 3) common error of the whole map in the ENU frame, m²; contained in `tree_cov`.
         tree: (N,) tree of each detection, -1 for none.
         weights: (M,) robust weights of the sightings.
-        residuals: factor type -> normalised residuals.
+        residuals: factor type -> normalised residuals (R,); `residual_ns`: factor type -> when each is of, (R,).
         scales: factor type -> factor that its noise was multiplied with; "trunks alike": the part of the trunks' that is owed to
             neighbours erring alike.
         offsets: what a clock, a mounting or the wheels' scale would have to be off by to explain the residuals best.
@@ -191,6 +191,7 @@ class Estimate:
     tree: NDArray[np.int64]
     weights: Array
     residuals: dict[str, Array] = field(default_factory=dict)
+    residual_ns: dict[str, Stamps] = field(default_factory=dict)
     scales: dict[str, float] = field(default_factory=dict)
     seconds: float = 0.0
     offsets: tuple[Offset, ...] = ()

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Ellipse
 
 from topograph.bags import Scan, Trunks
-from topograph.geometry import Array, transform
+from topograph.geometry import Array, Stamps, transform
 from topograph.topomap import TopoMap
 
 matplotlib.use("Agg")
@@ -110,6 +110,40 @@ def residual_figure(residuals: Mapping[str, Array]) -> bytes:
         ax.set_title(f"{name} (n={len(r)})", fontsize=9)
         ax.set_yticks([])
         ax.set_xlabel("σ", fontsize=8)
+    figure.tight_layout()
+    return _png(figure)
+
+
+WINDOWS = 120
+"""Parts of a run whose residuals are summed up."""
+
+
+def residual_time_figure(residuals: Mapping[str, Array], stamps_ns: Mapping[str, Stamps]) -> bytes:
+    """Size of the normalised residuals (R,) by factor type over time: middle and 95th percentile of each part of the run."""
+    shown = {k: (v, stamps_ns[k]) for k, v in residuals.items() if len(v) and len(stamps_ns.get(k, ())) == len(v)}
+    figure = Figure(figsize=(9, 1.5 * max(len(shown), 1) + 0.6))
+    start = min((int(t[0]) for _, t in shown.values()), default=0)
+    first = None
+    for k, (name, (r, ns)) in enumerate(shown.items()):
+        first = ax = figure.add_subplot(len(shown), 1, k + 1, sharex=first)
+        finite = np.isfinite(r)
+        t, size = (ns[finite] - start) * 1e-9, np.abs(r[finite])
+        ends = np.linspace(t.min(initial=0.0), t.max(initial=1.0), WINDOWS + 1)
+        part = np.clip(np.searchsorted(ends, t, side="right") - 1, 0, WINDOWS - 1)
+        order = np.argsort(part, kind="stable")
+        which, begins = np.unique(part[order], return_index=True)
+        groups = np.split(size[order], begins[1:])
+        middle = 0.5 * (ends[which] + ends[which + 1])
+        ax.plot(middle, [np.percentile(g, 95) for g in groups], color=BAD, lw=1, label="95th percentile")
+        ax.plot(middle, [np.median(g) for g in groups], color=PATH, lw=1, label="middle")
+        for level, color in ((1.96, BAD), (0.674, PATH)):
+            ax.axhline(level, color=color, lw=0.7, ls="--", alpha=0.7)
+        ax.set_ylabel(f"{name} [σ]", fontsize=8)
+        ax.set_ylim(bottom=0)
+        ax.grid(alpha=0.2)
+    if shown:
+        figure.axes[0].legend(fontsize=7, loc="upper right")
+        figure.axes[-1].set_xlabel("t [s]")
     figure.tight_layout()
     return _png(figure)
 

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
 from test_cli import call
 from test_store import make
 
 from topograph import store
 from topograph.errors import UsageError
 from topograph.exchange import WRITERS, read_tum, write
+from topograph.topomap import KINDS
 
 MAP = make(12)
 
@@ -94,6 +96,23 @@ def test_clouds_open_in_laspy(written, suffix: str) -> None:
     got = laspy.read(written(suffix))
     np.testing.assert_allclose(np.column_stack([got.x, got.y, got.z]), cloud(), atol=1.1e-3)
     assert set(got.point_source_id) == {int(MAP.ids[v.tree]) for v in MAP.viewpoints if len(v.cloud)}
+
+
+def test_rerun(written) -> None:
+    chunk = pytest.importorskip("rerun.chunk")
+    got = {c.entity_path: c.to_record_batch() for c in chunk.RrdReader(written(".rrd")).stream()}
+    trees = got["/map/trees"]
+    centre, quaternion = (np.array(trees.column(f"Cylinders3D:{k}")[0].as_py()) for k in ("centers", "quaternions"))
+    np.testing.assert_allclose(Rotation.from_quat(quaternion).apply([0.0, 0.0, 1.0]), MAP.axis, atol=1e-6)
+    np.testing.assert_allclose(centre - 0.75 * MAP.axis, MAP.p, atol=1e-5)
+    assert trees.column("Cylinders3D:labels")[0].as_py()[0] == f"{KINDS[MAP.kind[0]]} {MAP.ids[0]}"
+    robot = got["/map/robot"]
+    np.testing.assert_array_equal(np.asarray(robot.column("stamp")).astype(np.int64), MAP.stamps_ns)
+    at = np.array(robot.column("Transform3D:translation").to_pylist())[:, 0]
+    np.testing.assert_allclose(at, MAP.map_T_robot[:, :3, 3], atol=1e-5)
+    strips = np.array(got["/map/edges"].column("LineStrips3D:strips")[0].as_py())
+    np.testing.assert_allclose(np.linalg.norm(strips[:, 1] - strips[:, 0], axis=1), MAP.lengths, atol=1e-4)
+    assert len(got["/map/clouds"].column("Points3D:positions")[0]) == len(cloud())
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".bag"])

@@ -1,4 +1,4 @@
-"""The README's tables of the comparison, made of what `topograph compare` and `topograph compare --suite` leave as `metrics.json`:
+"""The tables of the comparison in docs/measured.md, made of what `topograph compare` and `topograph compare --suite` leave as `metrics.json`:
 
     python tools/readme_figures.py [--from METRICS] [--suite METRICS] [--check]
 
@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parents[1]
-README, KEPT, SUITE = HERE / "README.md", HERE / "docs" / "compare.json", HERE / "docs" / "suite.json"
+PAGE, KEPT, SUITE = HERE / "docs" / "measured.md", HERE / "docs" / "compare.json", HERE / "docs" / "suite.json"
 BEGIN, END = "<!-- compare: made by tools/readme_figures.py -->", "<!-- end of compare -->"
 SUITE_BEGIN, SUITE_END = "<!-- suite: made by tools/readme_figures.py -->", "<!-- end of suite -->"
 RATIOS = (
@@ -112,16 +112,16 @@ def main() -> int:
         KEPT.write_text(kept(a.source, ("A", "B", "C", "C map", "convergence", "conditions")))
     if a.suite is not None:
         SUITE.write_text(kept(a.suite, ("C", "C map", "convergence", "ratios")))
-    text = README.read_text()
+    text = PAGE.read_text()
     new = replaced(text, BEGIN, END, table(json.loads(KEPT.read_text())))
     new = replaced(new, SUITE_BEGIN, SUITE_END, suite_table(json.loads(SUITE.read_text())))
     if a.check:
         if text != new:
             print(
-                "README.md does not say what docs/compare.json and docs/suite.json say: run python tools/readme_figures.py"
+                "docs/measured.md does not say what docs/compare.json and docs/suite.json say: run python tools/readme_figures.py"
             )
         return int(text != new)
-    README.write_text(new)
+    PAGE.write_text(new)
     return 0
 
 

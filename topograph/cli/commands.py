@@ -484,6 +484,7 @@ def export(map_file: Path, output: Path, force: bool) -> None:
     .tum                          the path
     .ply .pcd .las .laz           clouds
     .mcap .bag                    markers, path, clouds for Foxglove and RViz
+    .rrd                          the same for Rerun
     """
     from topograph import store
     from topograph.exchange import WRITERS, write

@@ -25,6 +25,7 @@ from typing import Any, TypeVar
 import click
 
 from topograph import __version__
+from topograph.cli.help import Command, write_examples
 from topograph.errors import InputError, TopographError, UsageError
 
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -42,6 +43,11 @@ def _end(*_: Any) -> None:
 
 class _Group(click.Group):
     """Turns errors into one line on stderr and their exit code."""
+
+    command_class = Command
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        write_examples("topograph", formatter)
 
     def invoke(self, ctx: click.Context) -> Any:
         try:

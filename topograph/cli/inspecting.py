@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,14 @@ LONG_S = 100.0
 """Distances of clocks beyond are told in days."""
 
 
+EXTRAS = {
+    "thesis": ("open3d",),
+    "exchange": ("geopandas", "pyarrow", "laspy", "lazrs", "rasterio", "smfeval"),
+    "rerun": ("rerun",),
+}
+"""Extra -> modules that it brings; none is needed to map, localize, inspect, view or export to GeoJSON, CSV, KML, GraphML, TUM, PLY, PCD."""
+
+
 @main.command()
 def doctor() -> None:
     """Check this installation: libraries, compiler, a small map made and read back. Exit 1: something is missing."""
@@ -90,6 +99,10 @@ def doctor() -> None:
         except Exception as err:  # noqa: BLE001  # whatever is wrong with an installation is what is asked for
             bad += 1
             click.echo(f"{click.style('✗', fg='red')} {name}: {type(err).__name__}: {err}")
+    for extra, needs in EXTRAS.items():
+        missing = [n for n in needs if find_spec(n) is None]
+        if missing:
+            click.echo(f"- without {', '.join(missing)} (pip install 'topograph[{extra}]')")
     if bad:
         click.echo(
             "reinstall in a fresh environment: python3.11 -m venv .venv && .venv/bin/pip install topograph", err=True

@@ -9,6 +9,7 @@ from topograph.errors import UsageError
 from topograph.exchange.clouds import write_laz, write_pcd, write_ply
 from topograph.exchange.graphs import write_graphml
 from topograph.exchange.ros import write_ros
+from topograph.exchange.rrd import write_rrd
 from topograph.exchange.tables import write_csv, write_geojson, write_kml, write_parquet
 from topograph.exchange.tum import write_tum
 from topograph.exchange.whole import whole
@@ -33,6 +34,7 @@ WRITERS: dict[str, tuple[Callable[[TopoMap, Path], None], str, bool]] = {
     ".laz": (write_laz, "clouds, compressed (needs topograph[exchange])", True),
     ".mcap": (write_ros, "markers, path and clouds for Foxglove and RViz 2", True),
     ".bag": (write_ros, "the same for RViz (ROS 1)", True),
+    ".rrd": (write_rrd, "trees, path and clouds for Rerun (needs topograph[rerun])", True),
 }
 """Suffix -> writer, what it writes, whether it needs the clouds."""
 

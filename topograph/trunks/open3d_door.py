@@ -7,12 +7,18 @@ import functools
 import logging
 from typing import Any
 
+from topograph.errors import UsageError
+
 log = logging.getLogger(__name__)
 
 
 @functools.lru_cache(maxsize=1)
 def open3d() -> Any:
-    """The open3d module. Where Debian lacks libusb-1.0, PyPI's copy of it is loaded first."""
+    """The open3d module. Where Debian lacks libusb-1.0, PyPI's copy of it is loaded first.
+
+    Raises:
+        UsageError: it is not installed.
+    """
     try:
         import libusb_package
 
@@ -21,7 +27,9 @@ def open3d() -> Any:
             ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
     except (ImportError, OSError):  # elsewhere than on Linux open3d needs no help
         log.debug("libusb_package is not to be had")
-    import open3d as o3d
-
+    try:
+        import open3d as o3d
+    except ModuleNotFoundError as err:
+        raise UsageError("the thesis's front end needs open3d: pip install 'topograph[thesis]'") from err
     o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
     return o3d

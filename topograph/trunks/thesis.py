@@ -64,6 +64,7 @@ class ThesisDetector:
     """Scan -> trunks in `base_link`, without deskew: the thesis stood still. The same interface as `Detector`."""
 
     def __init__(self, base_T_lidar: Array, config: ThesisTrunksConfig) -> None:
+        open3d()  # where it is missing, that is said before a recording is read
         self.base_T_lidar = base_T_lidar
         self.config = config
 

@@ -14,7 +14,16 @@ def trunks_of(stamp_ns: int, points: np.ndarray, diameters: np.ndarray) -> Trunk
     """Points (N, 3) on trunks, in base_link, and diameters (N,), NaN where they are not known, as the localizer takes them."""
     n = len(points)
     up, none = np.tile([0.0, 0.0, 1.0], (n, 1)), np.full(n, np.nan)
-    bare = Trunks(stamp_ns, "base_link", points, up, diameters, np.full((n, 3, 3), np.nan), none, np.zeros(n))
+    bare = Trunks(
+        stamp_ns=stamp_ns,
+        frame="base_link",
+        p=points,
+        axis=up,
+        diameter=diameters,
+        cov=np.full((n, 3, 3), np.nan),
+        height=none,
+        score=np.zeros(n),
+    )
     return from_recorded(bare, np.eye(4), TrunksConfig())
 
 

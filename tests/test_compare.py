@@ -203,7 +203,16 @@ def seen(at: np.ndarray, robot: np.ndarray, stamp: int):
     p = np.column_stack([at - robot, np.zeros(n)])
     none = np.full(n, np.nan)
     up = np.tile([0.0, 0.0, 1.0], (n, 1))
-    return Trunks(stamp, "base_link", p, up, none, np.tile(1e-4 * np.eye(3), (n, 1, 1)), none, np.full(n, 2.0))
+    return Trunks(
+        stamp_ns=stamp,
+        frame="base_link",
+        p=p,
+        axis=up,
+        diameter=none,
+        cov=np.tile(1e-4 * np.eye(3), (n, 1, 1)),
+        height=none,
+        score=np.full(n, 2.0),
+    )
 
 
 TREES = np.array([[0.0, 0.0], [6.0, 1.0], [9.2, -4.1], [3.0, 7.3], [13.0, 5.5]])

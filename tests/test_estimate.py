@@ -32,7 +32,7 @@ def problem(
     p = transform(inverse(poses[k]), trees[j]) + sigma * rng.normal(size=(len(k), 3))
     cov = np.tile(sigma**2 * np.eye(3), (len(k), 1, 1))
     step = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
-    motion = Motion(stamps, poses, step, np.zeros(n), False, True)
+    motion = Motion(stamps_ns=stamps, odom_T_robot=poses, distance=step, turned=np.zeros(n), gyro=False, wheels=True)
     nothing = np.zeros(len(k))
     detections = Detections(
         stamps_ns=stamps,
@@ -50,11 +50,21 @@ def problem(
         free=np.zeros((0, 360), np.uint32),
         eye=np.zeros((n, 3)),
     )
-    sightings = Sightings(k, j, p, cov, np.ones(len(k), np.int64), np.zeros((len(k), 3)))
+    sightings = Sightings(keyframe=k, tree=j, p=p, cov=cov, count=np.ones(len(k), np.int64), late=np.zeros((len(k), 3)))
     return Problem(
-        stamps, poses, motion.sigma(MotionConfig(), stamps), motion, MotionConfig(), None, NO_FIXES, NO_HEADINGS, None,
-        detections, sightings, len(trees),
-    )  # fmt: skip
+        stamps_ns=stamps,
+        odom_T_robot=poses,
+        step_sigma=motion.sigma(MotionConfig(), stamps),
+        motion=motion,
+        motion_config=MotionConfig(),
+        inertial=None,
+        fixes=NO_FIXES,
+        headings=NO_HEADINGS,
+        datum=None,
+        detections=detections,
+        sightings=sightings,
+        n_trees=len(trees),
+    )
 
 
 @settings(max_examples=20, deadline=None)
@@ -98,7 +108,9 @@ def test_path_between_keyframes_passes_through_them() -> None:
     stamps = np.arange(5) * 10**9
     odom = np.stack([exp(np.array([0, 0, 0.1 * k, k, 0.1 * k, 0])) for k in range(5)])
     truth = np.stack([T @ exp(rng.normal(0, 0.05, 6)) for T in odom])
-    motion = Motion(stamps, odom, np.arange(5.0), np.zeros(5), False, True)
+    motion = Motion(
+        stamps_ns=stamps, odom_T_robot=odom, distance=np.arange(5.0), turned=np.zeros(5), gyro=False, wheels=True
+    )
     np.testing.assert_allclose(path_at(stamps, truth, motion, stamps), truth, atol=1e-9)
     middle = path_at(stamps, truth, motion, np.array([1_500_000_000]))[0]
     assert np.linalg.norm(middle[:3, 3] - truth[1:3, :3, 3].mean(0)) < 0.1

@@ -356,9 +356,15 @@ def test_multilateration_of_exact_ranges(seed: int) -> None:
 def trunks_at(p: Array, stamp: int) -> Trunks:
     n = len(p)
     return Trunks(
-        stamp, "base_link", np.column_stack([p, np.full(n, 0.8)]), np.tile([0.0, 0.0, 1.0], (n, 1)), np.full(n, np.nan),
-        np.tile(1e-3 * np.eye(3), (n, 1, 1)), np.full(n, 0.8), np.ones(n),
-    )  # fmt: skip
+        stamp_ns=stamp,
+        frame="base_link",
+        p=np.column_stack([p, np.full(n, 0.8)]),
+        axis=np.tile([0.0, 0.0, 1.0], (n, 1)),
+        diameter=np.full(n, np.nan),
+        cov=np.tile(1e-3 * np.eye(3), (n, 1, 1)),
+        height=np.full(n, 0.8),
+        score=np.ones(n),
+    )
 
 
 def test_the_thesis_finds_scattered_trees_and_explodes_in_rows() -> None:

@@ -109,7 +109,7 @@ def stated(scale: float, n: int = 800) -> tuple[list[Report], Truth, WorldInMap]
         found[:3, 3] += e[3:]
         none = np.zeros(0, np.int64)
         reports.append(
-            Report(s, "tracking", Fix(s, found, scale * cov, 1e-4), 1, 1e-4, np.zeros((0, 3)), none, np.zeros((0, 2), np.int64), 0.1, 0.1)
+            Report(stamp_ns=s, state="tracking", fix=Fix(s, found, scale * cov, 1e-4), hypotheses=1, risk=1e-4, places=np.zeros((0, 3)), trees=none, pairs=np.zeros((0, 2), np.int64), along=0.1, across=0.1)
         )  # fmt: skip
     return reports, Truth.of_path(stamps, true, HERE), WorldInMap("WGS84", np.eye(4), HERE, HERE)
 

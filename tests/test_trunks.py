@@ -44,7 +44,14 @@ def cylinder_scene(rings: int, x: float, y: float, diameter: float, columns: int
     t = np.minimum(ground, trunk)
     keep = np.isfinite(t)
     ring = np.tile(np.arange(rings), columns)[keep]
-    return Scan(10**18, "lidar", (d[keep] * t[keep, None]).astype(np.float32), ring.astype(np.int32), None, None)
+    return Scan(
+        stamp_ns=10**18,
+        frame="lidar",
+        xyz=(d[keep] * t[keep, None]).astype(np.float32),
+        ring=ring.astype(np.int32),
+        offset=None,
+        intensity=None,
+    )
 
 
 @pytest.mark.parametrize("rings", [16, 32, 64, 128])
@@ -117,7 +124,9 @@ def test_deskew_undoes_motion() -> None:
 )
 def test_odd_clouds_do_no_harm(xyz: np.ndarray) -> None:
     detector = Detector(MOUNT, TrunksConfig())
-    out = detector(Scan(1, "lidar", xyz.astype(np.float32), None, None, None), np.zeros(6))
+    out = detector(
+        Scan(stamp_ns=1, frame="lidar", xyz=xyz.astype(np.float32), ring=None, offset=None, intensity=None), np.zeros(6)
+    )
     assert np.isfinite(out.p).all()
     assert (out.score > 0).sum() <= 3
 
@@ -165,7 +174,14 @@ def test_unorganised_clouds_lose_little(lidar_run: tuple[Path, Truth]) -> None:
     found = again = 0
     for scan in scans:
         order = rng.permutation(len(scan.xyz))
-        mixed = Scan(scan.stamp_ns, scan.frame, scan.xyz[order], None, scan.offset[order], None)
+        mixed = Scan(
+            stamp_ns=scan.stamp_ns,
+            frame=scan.frame,
+            xyz=scan.xyz[order],
+            ring=None,
+            offset=scan.offset[order],
+            intensity=None,
+        )
         a, b = (k.select(k.score >= 0) for k in (detector(scan, np.zeros(6)), detector(mixed, np.zeros(6))))
         found += len(a)
         if len(b):

@@ -66,7 +66,14 @@ def run(bag: Path, every: int, front_end: str, shuffle: bool, no_time: bool) -> 
                 continue
             if shuffle:
                 order = rng.permutation(len(s.xyz))
-                s = Scan(s.stamp_ns, s.frame, s.xyz[order], None, None if s.offset is None else s.offset[order], None)
+                s = Scan(
+                    stamp_ns=s.stamp_ns,
+                    frame=s.frame,
+                    xyz=s.xyz[order],
+                    ring=None,
+                    offset=None if s.offset is None else s.offset[order],
+                    intensity=None,
+                )
             if no_time:
                 s = replace(s, offset=None)
             trunks.append(door.see(s))

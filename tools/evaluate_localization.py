@@ -167,8 +167,8 @@ def thesis_start(seed: int, c: StartsConfig, length: float) -> Start:
         trees = int((s.source >= 0).sum()) if trees < 0 else trees
         m = len(s.p)
         trunks = Trunks(
-            k + 1, "base_link", np.column_stack([s.p, np.full(m, 0.8)]), np.tile([0.0, 0.0, 1.0], (m, 1)),
-            np.full(m, np.nan), np.tile(0.01 * np.eye(3), (m, 1, 1)), np.full(m, 0.8), np.ones(m),
+            stamp_ns=k + 1, frame="base_link", p=np.column_stack([s.p, np.full(m, 0.8)]), axis=np.tile([0.0, 0.0, 1.0], (m, 1)),
+            diameter=np.full(m, np.nan), cov=np.tile(0.01 * np.eye(3), (m, 1, 1)), height=np.full(m, 0.8), score=np.ones(m),
         )  # fmt: skip
         began = time.perf_counter()
         report = method.step(trunks, Leg(step=s.motion, distance=s.distance, turned=abs(s.motion[2]), seconds=0.5))

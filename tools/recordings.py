@@ -129,7 +129,7 @@ class Plot:
             # The sensor may hang anyhow: the cloud is turned into its frame, where the caster looks from the origin.
             local = (self.points - T[:3, 3]) @ T[:3, :3]
             xyz, ring = self.sweeps.sweep(local, np.zeros(3), 0.0, np.random.default_rng(seed * 1000 + len(out)), elevation, tolerance_deg=tolerance)  # fmt: skip
-            scan = Scan(1 + len(out) * 10**8, "lidar", xyz, ring, None, None)
+            scan = Scan(stamp_ns=1 + len(out) * 10**8, frame="lidar", xyz=xyz, ring=ring, offset=None, intensity=None)
             out.append(Look(scan, plot_T_base, self._shown(transform(T, xyz.astype(float)))))
         return out
 
@@ -211,7 +211,14 @@ def map_at(poses: Array, trunks: list[Trunks], config: Config) -> Mapped:
     """What the mapper makes of trunks when the path (S, 4, 4) is known."""
     d = Detections.of(trunks)
     distance = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))]
-    motion = Motion(d.stamps_ns, poses, distance, np.zeros(len(distance)), True, True)
+    motion = Motion(
+        stamps_ns=d.stamps_ns,
+        odom_T_robot=poses,
+        distance=distance,
+        turned=np.zeros(len(distance)),
+        gyro=True,
+        wheels=True,
+    )
     track = follow(d, motion, config.trees)
     keep = screen(d, track, motion).keep
     d, track = d.select(keep), np.unique(track[keep], return_inverse=True)[1]
@@ -311,7 +318,14 @@ def street_candidates(first: int, last: int, every_ring: int) -> tuple[Array, Ar
     X, y, sweep = [], [], []
     for k, (start, end, xyz, ring, t) in enumerate(module("street_bag").sweeps(first, last, every_ring), first):
         step = log(inverse(poses[max(k - 1, 0)]) @ poses[k]) / ((end - start) * 1e-9) if k else np.zeros(6)
-        scan = Scan(end, "lidar", xyz.astype(np.float32), ring.astype(np.int32), (t - (end - start) * 1e-9).astype(np.float32), None)  # fmt: skip
+        scan = Scan(
+            stamp_ns=end,
+            frame="lidar",
+            xyz=xyz.astype(np.float32),
+            ring=ring.astype(np.int32),
+            offset=(t - (end - start) * 1e-9).astype(np.float32),
+            intensity=None,
+        )
         c = candidates(scan, mount, np.concatenate([step[3:], step[:3]]), TrunksConfig())
         p = transform(poses[k] @ inverse(mount), c.fits[:, :3])
         d = np.linalg.norm(p[:, None, :2] - known[None, :, :2], axis=2)

@@ -177,7 +177,14 @@ def _look(scene: Orchard, sensor: SensorConfig, seed: int, rng: np.random.Genera
     step = np.stack([from_xyz_rpy(twist[0] * np.cos(0.5 * a) * k, twist[0] * np.sin(0.5 * a) * k, 0, 0, 0, a) for k, a in zip(t, turn, strict=True)])  # fmt: skip
     swept = sweep(scene, sensor, world_T_base @ step @ base_T_lidar, float(rng.uniform(0, 40)), seed)
     offset = (swept.time - np.float32(span)).astype(np.float32)
-    scan = Scan(1, "lidar", swept.xyz, swept.ring.astype(np.int32), offset, swept.intensity)
+    scan = Scan(
+        stamp_ns=1,
+        frame="lidar",
+        xyz=swept.xyz,
+        ring=swept.ring.astype(np.int32),
+        offset=offset,
+        intensity=swept.intensity,
+    )
     known = twist + np.array([0.01, 0.002, 0, 0, 0, 0.005]) * rng.normal(size=6) * moving
     base = transform(base_T_lidar, swept.xyz.astype(float))
     u = twist[:3] + np.cross(np.broadcast_to(twist[3:], base.shape), base)

@@ -201,7 +201,17 @@ def test_metrics_tell_what_is_there() -> None:
     )
     datum = Datum(40.0, -8.0, 100.0)
     T = np.tile(np.eye(4), (2, 1, 1))
-    truth = Truth(datum, trees, np.tile([0, 0, 1.0], (400, 1)), np.full(400, 0.2), np.ones(400, np.int64), np.array([0, 10**9]), T, np.zeros(0, np.int64), np.zeros((0, 400), np.int32))  # fmt: skip
+    truth = Truth(
+        datum=datum,
+        trees=trees,
+        axes=np.tile([0, 0, 1.0], (400, 1)),
+        diameters=np.full(400, 0.2),
+        stems=np.ones(400, np.int64),
+        stamps_ns=np.array([0, 10**9]),
+        world_T_robot=T,
+        scan_stamps_ns=np.zeros(0, np.int64),
+        returns=np.zeros((0, 400), np.int32),
+    )
     C = np.array([[4e-4, 3e-4], [3e-4, 9e-4]])
     found = trees[:200] + np.column_stack([rng.multivariate_normal([0, 0], C, 200), np.zeros(200)])
     topo = TopoMap.of_points(np.concatenate([found[:, :2], [[-50.0, -50.0]]]))
@@ -227,7 +237,19 @@ def test_the_lever_arm_of_the_imu_is_where_it_is() -> None:
     mount = np.eye(4)
     mount[:3, 3] = lever
     p = problem(poses, np.array([[5.0, 5.0, 0.0]]), 0.05, np.random.default_rng(0))
-    p = replace(p, stamps_ns=keys, inertial=Inertial(stamps, gyro, accel, mount, np.zeros(3), 1e-3, 1e-2))
+    p = replace(
+        p,
+        stamps_ns=keys,
+        inertial=Inertial(
+            stamps_ns=stamps,
+            gyro=gyro,
+            accel=accel,
+            robot_T_imu=mount,
+            gyro_bias=np.zeros(3),
+            gyro_density=1e-3,
+            accel_density=1e-2,
+        ),
+    )
     inert = inertia(p)
     assert inert is not None
     import gtsam

@@ -94,16 +94,16 @@ class Mcl:
         n = np.zeros(0, np.int64)
         shown = self.x[self.rng.integers(0, PARTICLES, 50)]
         return Report(
-            stamp_ns,
-            "tracking" if fix else "ambiguous",
-            fix,
-            1 if fix else 50,
-            np.nan,
-            shown,
-            n,
-            np.zeros((0, 2), np.int64),
-            np.nan,
-            np.nan,
+            stamp_ns=stamp_ns,
+            state="tracking" if fix else "ambiguous",
+            fix=fix,
+            hypotheses=1 if fix else 50,
+            risk=np.nan,
+            places=shown,
+            trees=n,
+            pairs=np.zeros((0, 2), np.int64),
+            along=np.nan,
+            across=np.nan,
         )
 
 

@@ -150,14 +150,14 @@ def _trunks(
     keep = np.asarray((np.abs(p) < FARTHEST).all(axis=1) & np.isfinite(axis).all(axis=1))  # False for NaN
     n = int(keep.sum())
     return Trunks(
-        stamp_of(m.header),
-        m.header.frame_id.lstrip("/"),
-        p[keep],
-        axis[keep],
-        diameter[keep],
-        np.full((n, 3, 3), np.nan),
-        np.full(n, np.nan),
-        score[keep],
-        tuple(c for c, k in zip(clouds, keep, strict=True) if k) if clouds else (),
-        surface,
+        stamp_ns=stamp_of(m.header),
+        frame=m.header.frame_id.lstrip("/"),
+        p=p[keep],
+        axis=axis[keep],
+        diameter=diameter[keep],
+        cov=np.full((n, 3, 3), np.nan),
+        height=np.full(n, np.nan),
+        score=score[keep],
+        clouds=tuple(c for c, k in zip(clouds, keep, strict=True) if k) if clouds else (),
+        surface=surface,
     )

@@ -59,7 +59,7 @@ class Heading:
     sigma: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Trunks:
     """The trunks of one scan, N rows, in `frame`.
 

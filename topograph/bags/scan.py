@@ -15,7 +15,7 @@ _RING_NAMES = ("ring", "channel", "laser_id", "line", "laser_number")
 _TIME_NAMES = ("time", "t", "timestamp", "time_offset", "offset_time", "timeoffset", "time_stamp", "rel_time")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Scan:
     """Points of one sweep in the sensor's frame, order kept as recorded (unreturned points are NaN or dropped).
 
@@ -53,7 +53,14 @@ def decode(message: Any, stamp_ns: int) -> Scan:
     ring = None if ring_name is None else view[ring_name].astype(np.int32)
     intensity_name = next((names[n] for n in ("intensity", "i", "reflectivity") if n in names), None)
     intensity = None if intensity_name is None else np.asarray(view[intensity_name], np.float32)  # no copy: seldom used
-    return Scan(stamp_ns, message.header.frame_id.lstrip("/"), xyz, ring, _offsets(view, names, stamp_ns), intensity)
+    return Scan(
+        stamp_ns=stamp_ns,
+        frame=message.header.frame_id.lstrip("/"),
+        xyz=xyz,
+        ring=ring,
+        offset=_offsets(view, names, stamp_ns),
+        intensity=intensity,
+    )
 
 
 def _view(message: Any) -> NDArray[Any]:

@@ -130,7 +130,7 @@ def _suite(
     if not first.isdigit() or not (last or first).isdigit():
         raise UsageError(f"--seeds {seeds}: give FIRST-LAST")
     jobs = [
-        Job(d, s, g, w, longest, 3, starts, detections)
+        Job(design=d, seed=s, gnss=g, driving=w, longest_s=longest, runs=3, starts=starts, detections=detections)
         for d, s, g, w in product(
             designs.split(","), range(int(first), int(last or first) + 1), gnss.split(","), driving.split(",")
         )

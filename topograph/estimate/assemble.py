@@ -21,7 +21,9 @@ from topograph.trees.sightings import DELAY_NS, nearest_keyframe
 def empty_sightings() -> Sightings:
     """No sightings yet."""
     none = np.zeros(0, np.int64)
-    return Sightings(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)), none, np.zeros((0, 3)))
+    return Sightings(
+        keyframe=none, tree=none, p=np.zeros((0, 3)), cov=np.zeros((0, 3, 3)), count=none, late=np.zeros((0, 3))
+    )
 
 
 LEAST_FIXES = 3
@@ -71,9 +73,21 @@ def assemble(
     headings = _headings(keyframes_ns, odom, motion, streams, robot_T_baseline, datum)
     up, up_sigma = _mean_axes(keyframes_ns, odom, detections)
     return Problem(
-        keyframes_ns, odom, motion.sigma(motion_config, keyframes_ns), motion, motion_config, inertial, fixes, headings,
-        datum, detections, empty_sightings(), 0, up=up, up_sigma=up_sigma,
-    )  # fmt: skip
+        stamps_ns=keyframes_ns,
+        odom_T_robot=odom,
+        step_sigma=motion.sigma(motion_config, keyframes_ns),
+        motion=motion,
+        motion_config=motion_config,
+        inertial=inertial,
+        fixes=fixes,
+        headings=headings,
+        datum=datum,
+        detections=detections,
+        sightings=empty_sightings(),
+        n_trees=0,
+        up=up,
+        up_sigma=up_sigma,
+    )
 
 
 SEEN_FROM = 8.0

@@ -32,7 +32,7 @@ _NONE = Kernel("none")
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Pass:
     """Losses and noise of one solve: least deviation of a fix (m), factors on the noise of trunks and fixes, the
     part of the trunks' that the likeness of neighbours makes, and the deviation of the trees' heights about where they begin (m)."""
@@ -88,7 +88,11 @@ def _solve(problem: Problem, config: EstimateConfig, *, quick: bool, patient: bo
     most = config.quick_sightings if quick else config.most_sightings
     problem = replace(problem, sightings=_nearest(problem.sightings, most))
     values = _values(problem, poses, trees, inert)
-    first = Pass(huber, huber, 0.05, height=QUICK_HEIGHT) if quick else Pass(huber, huber, 0.0)
+    first = (
+        Pass(trunk=huber, fix=huber, fix_floor=0.05, height=QUICK_HEIGHT)
+        if quick
+        else Pass(trunk=huber, fix=huber, fix_floor=0.0)
+    )
     steps, tolerance = (3 * config.iterations, 1e-6)
     if quick:
         steps, tolerance = (3 * config.iterations, 1e-5) if patient else (10, 1e-3)
@@ -97,7 +101,7 @@ def _solve(problem: Problem, config: EstimateConfig, *, quick: bool, patient: bo
         return _estimate(problem, config, values, first, None, time.perf_counter() - began)
     scales = _learned_scales(problem, values, first) if config.learn_scale else (1.0, 1.0, 1.0)
     tukey = Kernel("tukey", config.tukey)
-    last = Pass(tukey, tukey, 0.0, *scales)
+    last = Pass(trunk=tukey, fix=tukey, trunk_scale=scales[0], fix_scale=scales[1], alike=scales[2])
     values = optimised(graph_of(problem, last, config, inert), values, config.iterations)
     for _ in range(RELEARNT if config.learn_scale else 0):
         scales = _learned_scales(problem, values, last)
@@ -129,14 +133,24 @@ def _nearest(s: Sightings, most: int) -> Sightings:
     rank_in_tree = np.empty(len(s), np.int64)
     rank_in_tree[by_tree] = np.arange(len(s)) - np.searchsorted(tree, tree, side="left")
     keep = (rank < most) | (rank_in_tree < 2)
-    return Sightings(s.keyframe[keep], s.tree[keep], s.p[keep], s.cov[keep], s.count[keep], s.late[keep])
+    return Sightings(
+        keyframe=s.keyframe[keep],
+        tree=s.tree[keep],
+        p=s.p[keep],
+        cov=s.cov[keep],
+        count=s.count[keep],
+        late=s.late[keep],
+    )
 
 
 def _poses_alone(problem: Problem, poses: Array, config: EstimateConfig) -> Array:
     """Odometry, fixes and headings only, under losses that narrow from metres to decimetres."""
     values = _values(problem, poses, np.zeros((0, 3)), None)
     if len(problem.fixes.keyframe) >= 3:
-        for p in (Pass(_NONE, Kernel("huber", 1.345), 1.0), Pass(_NONE, Kernel("cauchy", 1.0), 0.1)):
+        for p in (
+            Pass(trunk=_NONE, fix=Kernel("huber", 1.345), fix_floor=1.0),
+            Pass(trunk=_NONE, fix=Kernel("cauchy", 1.0), fix_floor=0.1),
+        ):
             values = optimised(graph_of(problem, p, config, None, without=("trunk", "tree")), values, 30, 1e-4)
     return _path(problem, values)
 

@@ -94,7 +94,7 @@ class Link:
     a_T_b: Array
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Problem:
     """A run, ready for an estimator.
 

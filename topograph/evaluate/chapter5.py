@@ -22,7 +22,7 @@ HEIGHT = 0.8
 """Trunks are looked at so high above ground, m; a method that knows no axis stands there, not at the foot."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class NodeErrors:
     """Nodes of a map against the truth's trees, as matched within the widest gate.
 
@@ -47,7 +47,14 @@ def node_errors(topo: TopoMap, truth: Truth, gate: float = GATES[-1], world: Wor
     true, lifted = world.points(truth.trees), world.points(truth.trees + truth.axes * HEIGHT)
     above = topo.p + topo.axis * (HEIGHT / np.maximum(topo.axis[:, 2:], 0.3))
     i, j = match(above[:, :2], lifted[:, :2], gate)
-    return NodeErrors(i, j, (topo.p[i] - true[j])[:, :2], (above[i] - lifted[j])[:, :2], len(topo), visible(truth))
+    return NodeErrors(
+        node=i,
+        tree=j,
+        foot=(topo.p[i] - true[j])[:, :2],
+        above=(above[i] - lifted[j])[:, :2],
+        nodes=len(topo),
+        seen=visible(truth),
+    )
 
 
 def node_metrics(topo: TopoMap, truth: Truth) -> list[Metric]:

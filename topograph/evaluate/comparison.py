@@ -47,7 +47,7 @@ class Track:
     true_xy: Array | None
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Comparison:
     """All that the tables and figures are drawn from.
 
@@ -82,7 +82,7 @@ class Comparison:
         return [_figure(key, ms) for key, ms in found.items()]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Figure:
     """One figure over the runs: `n` of them, and the 95 % interval (low, high), NaN where one run says nothing of it."""
 
@@ -101,7 +101,10 @@ def _figure(key: tuple[str, str, str], metrics: Sequence[Metric]) -> Figure:
     values = np.array([m.value for m in metrics], float)
     known = values[np.isfinite(values)]
     value = float(known.mean()) if len(known) else float("nan")
-    return Figure(*key, value, metrics[0].unit, metrics[0].better, len(known), *bootstrap(known.tolist()))
+    low, high = bootstrap(known.tolist())
+    return Figure(
+        table=key[0], name=key[1], metric=key[2], value=value, unit=metrics[0].unit, better=metrics[0].better, n=len(known), low=low, high=high,
+    )  # fmt: skip
 
 
 def wrong_starts(starts: Sequence[Start]) -> tuple[int, int, float, float]:

@@ -17,7 +17,7 @@ from topograph.geometry import Array, Datum, Stamps
 _COLUMNS = ("id", "lat", "lon", "h", "x", "y", "z", "axis_x", "axis_y", "axis_z", "diameter", "stems")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Truth:
     """Trees and path in the ENU frame of `datum` ("world"), or in a local frame. Either may be missing.
 
@@ -51,17 +51,22 @@ class Truth:
     ) -> Truth:
         """A path (M,), (M, 4, 4) alone."""
         n = np.zeros((0, 3))
-        return Truth(datum, n, n, np.zeros(0), np.zeros(0, np.int64), stamps_ns, world_T_robot, *_no_returns(0), sigma)
+        scans_ns, returns = _no_returns(0)
+        return Truth(
+            datum=datum, trees=n, axes=n, diameters=np.zeros(0), stems=np.zeros(0, np.int64), stamps_ns=stamps_ns, world_T_robot=world_T_robot,
+            scan_stamps_ns=scans_ns, returns=returns, sigma=sigma,
+        )  # fmt: skip
 
     @staticmethod
     def of_trees(
         datum: Datum | None, trees: Array, *, axes: Array, diameters: Array, stems: NDArray[np.int64], sigma: float
     ) -> Truth:
         """Trees (N, 3) alone."""
-        nowhere = np.zeros((0, 4, 4))
+        scans_ns, returns = _no_returns(len(trees))
         return Truth(
-            datum, trees, axes, diameters, stems, np.zeros(0, np.int64), nowhere, *_no_returns(len(trees)), sigma
-        )
+            datum=datum, trees=trees, axes=axes, diameters=diameters, stems=stems, stamps_ns=np.zeros(0, np.int64),
+            world_T_robot=np.zeros((0, 4, 4)), scan_stamps_ns=scans_ns, returns=returns, sigma=sigma,
+        )  # fmt: skip
 
     def save(self, folder: Path) -> None:
         """Write `trees.csv`, `path.tum`, `datum.json`, `returns.npz` into `folder`; the frame must be georeferenced."""
@@ -105,15 +110,15 @@ class Truth:
             return np.array([[float(r[n]) for n in names] for r in rows]).reshape(len(rows), len(names))
 
         return Truth(
-            Datum(d["lat"], d["lon"], d["h"]),
-            column("x", "y", "z"),
-            column("axis_x", "axis_y", "axis_z"),
-            column("diameter")[:, 0],
-            column("stems")[:, 0].astype(np.int64),
-            stamps,
-            poses,
-            scans,
-            returns,
+            datum=Datum(d["lat"], d["lon"], d["h"]),
+            trees=column("x", "y", "z"),
+            axes=column("axis_x", "axis_y", "axis_z"),
+            diameters=column("diameter")[:, 0],
+            stems=column("stems")[:, 0].astype(np.int64),
+            stamps_ns=stamps,
+            world_T_robot=poses,
+            scan_stamps_ns=scans,
+            returns=returns,
         )
 
 

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
-from topograph.errors import UsageError
+import numpy as np
+
+from topograph.errors import InputError, UsageError
 from topograph.exchange.attributes import columns
 from topograph.exchange.whole import whole
+from topograph.geometry import Datum
 from topograph.topomap import TopoMap
 
 
@@ -93,6 +97,29 @@ def geodataframe(topo: TopoMap) -> Any:
         geometry=points,
         crs=4326 if topo.datum is not None else None,
     )
+
+
+def topomap_of(frame: Any, sigma: float = 0.05) -> TopoMap:
+    """A map of surveyed trees to localize in: a GeoDataFrame of points in any CRS, with a column `diameter` (m) where it is known, each
+    known to `sigma` m. Without a CRS its x and y are metres in a frame of their own.
+
+    Raises:
+        InputError: what is no point, or no number.
+    """
+    if not (frame.geometry.geom_type == "Point").all():
+        raise InputError("trees are points: of polygons, such as crowns, take the centroids first")
+    datum = None
+    if frame.crs is None:
+        p = np.column_stack([frame.geometry.x, frame.geometry.y, np.zeros(len(frame))])
+    else:
+        g = frame.geometry.to_crs(4326)
+        h = np.nan_to_num(np.where(g.has_z, g.z, 0.0))
+        datum = Datum(float(np.median(g.y)), float(np.median(g.x)), float(np.median(h)))
+        p = datum.to_enu(np.column_stack([g.y, g.x, h]))
+    if not np.isfinite(p).all():
+        raise InputError("a tree's place is not a number")
+    diameter = frame["diameter"].to_numpy(float) if "diameter" in frame else np.full(len(frame), np.nan)
+    return replace(TopoMap.of_points(p[:, :2], sigma), p=p, datum=datum, diameter=diameter)
 
 
 def georeferenced(topo: TopoMap, what: str) -> TopoMap:

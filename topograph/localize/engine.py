@@ -35,7 +35,7 @@ NO_PAIRS = np.zeros((0, 2), np.int64)
 STATES = ("searching", "ambiguous", "tracking", "degraded", "lost")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Belief:
     """What is believed after a scan.
 
@@ -62,7 +62,7 @@ class Belief:
         return self.pose is not None
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Hunt:
     """One attempt to find the place: a submap, what the last search found, and what that is worth now."""
 
@@ -82,7 +82,7 @@ class Engine:
     def __init__(self, index: MapIndex, config: LocalizeConfig) -> None:
         self.index, self.config = index, config
         self.visibility = Visibility(config)
-        self.hunt = _Hunt(Submap(config, self.visibility))
+        self.hunt = _Hunt(submap=Submap(config, self.visibility))
         self.track: Filter | None = None
         self.graph: Hypothesis | None = None
         self.state = "searching"
@@ -104,10 +104,10 @@ class Engine:
         if blinded:
             if self.track is not None:
                 self._lose(sweep)
-            self.hunt = _Hunt(Submap(self.config, self.visibility))
+            self.hunt = _Hunt(submap=Submap(self.config, self.visibility))
             return self._belief(NO_PAIRS)
         if doubted is not None and self.track is not None:
-            move, self.hunt = doubted, _Hunt(Submap(self.config, self.visibility))
+            move, self.hunt = doubted, _Hunt(submap=Submap(self.config, self.visibility))
         self.hunt.submap.step(move, sweep)
         if self.track is None:
             self._look()
@@ -203,7 +203,7 @@ class Engine:
         """A long drive that fits nowhere begins anew: dead reckoning has bent the submap, or it began off the map."""
         h = self.hunt
         if h.submap.filter.run > 3.0 * self.config.forget and h.posterior.unknown > 0.5:
-            self.hunt = _Hunt(Submap(self.config, self.visibility))
+            self.hunt = _Hunt(submap=Submap(self.config, self.visibility))
 
     def begin_at(self, pose: Array, cov: Array) -> None:
         """Track from a pose (3,) x, y, yaw in the map that somebody else is sure of, with its covariance (3, 3)."""
@@ -238,7 +238,7 @@ class Engine:
         self._met[:] = 0.0
         self._matched_at = self.track.run
         self._dragged_at = -np.inf
-        self.hunt = _Hunt(Submap(self.config, self.visibility))
+        self.hunt = _Hunt(submap=Submap(self.config, self.visibility))
         return self.track
 
     # -- tracking -------------------------------------------------------------------------------------------------
@@ -361,7 +361,7 @@ class Engine:
                     return
                 self.risk = p.risk
         if f.run >= c.shadow and h.search is None:
-            self.hunt = _Hunt(Submap(c, self.visibility))
+            self.hunt = _Hunt(submap=Submap(c, self.visibility))
 
     def _lose(self, sweep: Sweep) -> None:
         """The evidence has turned: forget the pose and begin with this scan."""
@@ -370,7 +370,7 @@ class Engine:
         self.risk = 1.0
         self.losses += 1
         self.sums[:] = 0.0
-        self.hunt = _Hunt(Submap(self.config, self.visibility))
+        self.hunt = _Hunt(submap=Submap(self.config, self.visibility))
         still = Move(np.zeros(3), np.zeros((3, 3)), 0.0)
         self.hunt.submap.step(still, sweep)
 
@@ -382,7 +382,16 @@ class Engine:
             pose, cov = f.mean[:3].copy(), f.cov[:3, :3].copy()
             if self.graph is not None:
                 pose, cov = self.graph.pose.copy(), self.graph.cov.copy()
-            return Belief(self.state, pose, cov, 1, self.risk, pose[None], np.ones(1), pairs)
+            return Belief(
+                state=self.state,
+                pose=pose,
+                cov=cov,
+                hypotheses=1,
+                risk=self.risk,
+                places=pose[None],
+                weights=np.ones(1),
+                pairs=pairs,
+            )
         p = self.hunt.posterior
         n = 0
         if len(p.p) and p.p.sum() > 0:
@@ -397,7 +406,16 @@ class Engine:
         places = np.stack(
             [shown[:, 0] + c * robot[0] - s * robot[1], shown[:, 1] + s * robot[0] + c * robot[1], shown[:, 2] + robot[2]], axis=1
         )  # fmt: skip
-        return Belief(self.state, None, np.full((3, 3), np.nan), n, p.risk, places, p.p[: len(places)], pairs)
+        return Belief(
+            state=self.state,
+            pose=None,
+            cov=np.full((3, 3), np.nan),
+            hypotheses=n,
+            risk=p.risk,
+            places=places,
+            weights=p.p[: len(places)],
+            pairs=pairs,
+        )
 
 
 def anchored(hunt: _Hunt, index: MapIndex, config: LocalizeConfig) -> Filter:

@@ -26,7 +26,7 @@ LOOKS_EVERY = 2.0
 """Metres after which a further look counts as a new trial for the prior of another orchard."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Posterior:
     """Over placements of the submap; probabilities sum to one together with `unknown` and `rest`.
 
@@ -54,7 +54,15 @@ class Posterior:
 
 def nothing() -> Posterior:
     """Before anything is known."""
-    return Posterior(np.zeros((0, 3)), np.zeros(0), 1.0, 0.0, np.zeros((0, 0), np.int64), np.zeros(0), np.zeros(0))
+    return Posterior(
+        pose=np.zeros((0, 3)),
+        p=np.zeros(0),
+        unknown=1.0,
+        rest=0.0,
+        tree=np.zeros((0, 0), np.int64),
+        scale=np.zeros(0),
+        log=np.zeros(0),
+    )
 
 
 def describe(submap: Submap, index: MapIndex, config: LocalizeConfig) -> tuple[Landmarks, NDArray[np.int64]]:
@@ -77,7 +85,9 @@ def describe(submap: Submap, index: MapIndex, config: LocalizeConfig) -> tuple[L
     weight = f.weight[rows]
     diameter = np.where(weight > 0, f.diameter[rows], np.nan)
     d_var = 1.0 / np.maximum(weight, 1e-9) + c.diameter_sigma**2
-    return Landmarks(m, cov, spread(m, cov), diameter, d_var, tree, other, lasting), rows
+    return Landmarks(
+        m=m, cov=cov, var=spread(m, cov), diameter=diameter, diameter_var=d_var, tree=tree, other=other, lasting=lasting
+    ), rows
 
 
 def _beta_binomial(hits: Array, looks: Array, a: float, b: float) -> Array:
@@ -128,13 +138,13 @@ def weigh(found: Found, marks: Landmarks, submap: Submap, index: MapIndex, confi
     rest = np.logaddexp(rest, dropped)
     total = np.logaddexp(np.logaddexp.reduce(placed), np.logaddexp(unknown, rest))
     return Posterior(
-        pose,
-        np.exp(placed - total),
-        float(np.exp(unknown - total)),
-        float(np.exp(rest - total)),
-        tree,
-        scale,
-        placed,
+        pose=pose,
+        p=np.exp(placed - total),
+        unknown=float(np.exp(unknown - total)),
+        rest=float(np.exp(rest - total)),
+        tree=tree,
+        scale=scale,
+        log=placed,
     )
 
 

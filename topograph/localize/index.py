@@ -15,7 +15,7 @@ DIAMETER_NOISE = 0.02
 """Standard deviation of a mapped diameter, m: orchards whose diameters vary no more than this are all alike."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class MapIndex:
     """Trees in the plane, and what answers the search's questions in constant time.
 
@@ -114,12 +114,27 @@ def build_index(
         float(np.prod(high - low + 10.0)) if len(covered) * 100.0 > 0.3 * np.prod(high - low) else len(covered) * 400.0
     )
     return MapIndex(
-        xy, var, diameter, low, cell, nearest, bucket, buckets, start, order, flat.astype(np.int32),
-        length[by_length].astype(np.float32), pairs[by_length, 0].astype(np.int32), pairs[by_length, 1].astype(np.int32),
-        density, area, jitter,
-        float(np.clip(jitter**2 / (map_sigma**2 + float(np.median(var))) - 0.4, 0.0, 1.0)),
-        float(np.mean(diameter[ok])) if ok.any() else np.nan, _spread(diameter[ok]),
-    )  # fmt: skip
+        xy=xy,
+        var=var,
+        diameter=diameter,
+        origin=low,
+        cell=cell,
+        nearest=nearest,
+        bucket=bucket,
+        buckets=buckets,
+        start=start,
+        member=order,
+        place=flat.astype(np.int32),
+        length=length[by_length].astype(np.float32),
+        a=pairs[by_length, 0].astype(np.int32),
+        b=pairs[by_length, 1].astype(np.int32),
+        density=density,
+        area=area,
+        jitter=jitter,
+        trust=float(np.clip(jitter**2 / (map_sigma**2 + float(np.median(var))) - 0.4, 0.0, 1.0)),
+        diameter_mean=float(np.mean(diameter[ok])) if ok.any() else np.nan,
+        diameter_sd=_spread(diameter[ok]),
+    )
 
 
 def _covered_area(xy: Array, gap: float) -> float:

@@ -171,7 +171,10 @@ class GraphMethod:
         """One scan further."""
         if self.engine is None:
             if not len(trunks):
-                return Report(trunks.stamp_ns, "searching", None, 0, 1.0, np.zeros((0, 3)), *_NONE, np.nan, np.nan)
+                return Report(
+                    stamp_ns=trunks.stamp_ns, state="searching", fix=None, hypotheses=0, risk=1.0, places=np.zeros((0, 3)),
+                    trees=np.zeros(0, np.int64), pairs=np.zeros((0, 2), np.int64), along=np.nan, across=np.nan,
+                )  # fmt: skip
             self.engine = self._begin(trunks)
         if len(trunks) and leg.seconds > 0 and np.array_equal(trunks.p, self._last_p):
             trunks = trunks.select(np.zeros(len(trunks), bool))  # a driver that repeats itself: nothing was seen
@@ -203,9 +206,18 @@ class GraphMethod:
         across = side @ belief.cov[:2, :2] @ side
         ids = self.topo.ids[np.unique(belief.pairs[:, 1])]
         return Report(
-            trunks.stamp_ns, belief.state, fix, belief.hypotheses, belief.risk, belief.places, ids, belief.pairs,
-            float(np.sqrt(along)), float(np.sqrt(across)), belief.weights,
-        )  # fmt: skip
+            stamp_ns=trunks.stamp_ns,
+            state=belief.state,
+            fix=fix,
+            hypotheses=belief.hypotheses,
+            risk=belief.risk,
+            places=belief.places,
+            trees=ids,
+            pairs=belief.pairs,
+            along=float(np.sqrt(along)),
+            across=float(np.sqrt(across)),
+            weights=belief.weights,
+        )
 
     def _upright(self, leg: Leg, trunks: Trunks) -> Leg:
         """Without an IMU the trunks say which way is up: on average they grow vertically."""
@@ -261,9 +273,6 @@ class GraphMethod:
 
 def _known(variance: float) -> float:
     return float(variance) if np.isfinite(variance) else 0.0
-
-
-_NONE = (np.zeros(0, np.int64), np.zeros((0, 2), np.int64))
 
 
 def row_direction(topo: TopoMap) -> Array:

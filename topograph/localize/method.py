@@ -29,7 +29,7 @@ class Fix:
     risk: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Report:
     """What is believed after one scan.
 

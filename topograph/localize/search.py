@@ -17,7 +17,7 @@ from topograph.localize.config import LocalizeConfig
 from topograph.localize.index import MapIndex
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Landmarks:
     """A submap's landmarks as the search sees them.
 

@@ -147,7 +147,18 @@ class ThesisMethod:
         if not n:
             self.started = False
         pairs = np.zeros((0, 2), np.int64)
-        return Report(stamp_ns, state, fix, n, np.nan, places[:200], trees, pairs, np.nan, np.nan)
+        return Report(
+            stamp_ns=stamp_ns,
+            state=state,
+            fix=fix,
+            hypotheses=n,
+            risk=np.nan,
+            places=places[:200],
+            trees=trees,
+            pairs=pairs,
+            along=np.nan,
+            across=np.nan,
+        )
 
     def _by_distance(self, z: Array) -> list[NDArray[np.int64]]:
         """Algorithm 4: candidate nodes of each trunk."""

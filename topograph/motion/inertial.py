@@ -16,7 +16,7 @@ from topograph.session import Streams
 GRAVITY = 9.80665
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Inertial:
     """Samples (I, 3) turned into the base's axes, and what they say of themselves.
 
@@ -98,8 +98,8 @@ def align_imu(streams: Streams, robot_T_imu: Array | None) -> tuple[Inertial | N
     bias = _bias(streams, gyro, dt)
     root = np.sqrt(dt)
     inertial = Inertial(
-        streams.imu_ns, gyro, accel, robot_T_imu, bias,
-        max(_white(gyro) * root, 1e-4), max(_white(accel) * root, 2e-3),
+        stamps_ns=streams.imu_ns, gyro=gyro, accel=accel, robot_T_imu=robot_T_imu, gyro_bias=bias,
+        gyro_density=max(_white(gyro) * root, 1e-4), accel_density=max(_white(accel) * root, 2e-3),
     )  # fmt: skip
     return inertial, streams, notes
 

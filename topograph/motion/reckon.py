@@ -52,7 +52,7 @@ class MotionConfig:
     tilt_time_s: Positive = 4.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
     """Dead-reckoned poses `odom_T_robot` (M, 4, 4) at `stamps_ns` (M,), rising.
 
@@ -180,7 +180,9 @@ def _joined(streams: Streams, step: Array, inertial: Inertial | None, config: Mo
         for k in range(n - 1):
             T[k + 1] = T[k] @ step[k]
         turned = np.concatenate([[0.0], np.cumsum(np.abs(yaw_of(step)))])
-        return Motion(streams.odometry_ns, T, distance, turned, False, True)
+        return Motion(
+            stamps_ns=streams.odometry_ns, odom_T_robot=T, distance=distance, turned=turned, gyro=False, wheels=True
+        )
     R_imu = _attitude(inertial, np.interp(inertial.stamps_ns, streams.odometry_ns, _speed(streams, distance)), config)
     imu_ns, R_imu, unseen = _over_gaps(inertial.stamps_ns, R_imu, streams.odometry_ns, yaw_of(step))
     pose = np.tile(np.eye(4), (len(R_imu), 1, 1))
@@ -196,7 +198,15 @@ def _joined(streams: Streams, step: Array, inertial: Inertial | None, config: Mo
     T[:, :3, :3] = R
     T[1:, :3, 3] = np.cumsum(moves, axis=0)
     turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.unwrap(yaw_of(T)))))])
-    return Motion(streams.odometry_ns, T, distance, turned, True, True, unseen=unseen)
+    return Motion(
+        stamps_ns=streams.odometry_ns,
+        odom_T_robot=T,
+        distance=distance,
+        turned=turned,
+        gyro=True,
+        wheels=True,
+        unseen=unseen,
+    )
 
 
 IMU_GAP_S = 0.2
@@ -256,7 +266,7 @@ def _from_fixes(streams: Streams, inertial: Inertial | None, config: MotionConfi
         turn = float(np.angle(np.mean(np.exp(1j * (course - yaw_of(R))[moving]))))
         T[:, :3, :3] = (planar(0.0, 0.0, turn) @ R)[:, :3, :3]
     turned = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.unwrap(yaw_of(T)))))])
-    return Motion(stamps, T, distance, turned, gyro, False)
+    return Motion(stamps_ns=stamps, odom_T_robot=T, distance=distance, turned=turned, gyro=gyro, wheels=False)
 
 
 def _overlap(a: Stamps, b: Stamps) -> float:

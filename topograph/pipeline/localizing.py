@@ -22,7 +22,7 @@ from topograph.pipeline.read import WHOLE, Heard, child_mount, refuse_damaged, s
 from topograph.topomap import TopoMap
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Replay:
     """A localized run.
 

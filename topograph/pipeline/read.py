@@ -231,7 +231,7 @@ _LAG_NS = 2_000_000_000
 """A message is recorded at most this long after its stamp, or it is of no use to a scan of another part."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Part:
     """Trunks of the scans that were recorded within one part of a recording, and the account of its point clouds."""
 
@@ -301,7 +301,14 @@ def _detect_part(paths: Sequence[Path], config: Config, start_ns: int, stop_ns: 
             out += _careful(front_end, scan, recording.skipped)
         given = recording.given["points"]
         skipped = Counter({k: v for k, v in recording.skipped.items() if k.startswith("points")})
-        return _Part(out, skipped, given, recording.undecoded, recording.clocks.notes, front_end.untimed)
+        return _Part(
+            trunks=out,
+            skipped=skipped,
+            given=given,
+            undecoded=recording.undecoded,
+            clocks=recording.clocks.notes,
+            untimed=front_end.untimed,
+        )
 
 
 def child_mount(find: Callable[[str], Array | None], child: str, config: Config, notes: list[str]) -> Array:

@@ -35,7 +35,7 @@ class Played:
     seconds: dict[str, float] = field(default_factory=dict)
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Source:
     """What is played: messages in the order of their coming, the mountings of their frames, and what is said of it at the end.
 

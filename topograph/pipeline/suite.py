@@ -31,7 +31,7 @@ AT_STOPS_M = 2.0
 """Between two stops, as in the thesis (5.3)."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
     """An orchard with its runs; `driving` is "driving" or "stops" (clouds only while the robot stands)."""
 

@@ -229,7 +229,7 @@ def _unpacked(data: bytes) -> tuple[Trunks | None, list[Message]]:
     clouds = tuple(np.split(read["clouds"], np.cumsum(read["sizes"])[:-1])) if len(read["sizes"]) else ()
     return (
         Trunks(
-            int(read["stamp_ns"]), str(read["frame"]), clouds=clouds, surface=bool(read["surface"]),
+            stamp_ns=int(read["stamp_ns"]), frame=str(read["frame"]), clouds=clouds, surface=bool(read["surface"]),
             **{name: read[name] for name in OF_TRUNKS},
         ),
         messages,

@@ -13,7 +13,7 @@ from topograph.bags import Fix, Heading, Imu, Odometry
 from topograph.geometry import Array, Datum, Stamps, from_quaternion
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Streams:
     """All of a run but its scans; each block is sorted by stamp and may be empty.
 
@@ -119,20 +119,20 @@ class StreamsBuilder:
             if products
         }
         return Streams(
-            np.array([o.stamp_ns for o in odometry], np.int64),
-            from_quaternion(pose[:, :3], pose[:, 3:]) if len(pose) else np.zeros((0, 4, 4)),
-            np.array([o.twist for o in odometry]).reshape(-1, 6),
-            np.array([m.stamp_ns for m in imu], np.int64),
-            np.array([m.gyro for m in imu]).reshape(-1, 3),
-            np.array([m.accel for m in imu]).reshape(-1, 3),
-            np.array([f.stamp_ns for f in fixes], np.int64),
-            np.array([f.lat_lon_h for f in fixes]).reshape(-1, 3),
-            np.array([f.cov for f in fixes]).reshape(-1, 3, 3),
-            np.array([f.status for f in fixes], np.int64),
-            np.array([h.stamp_ns for h in headings], np.int64),
-            np.array([h.yaw for h in headings]),
-            np.array([h.sigma for h in headings]),
-            frames,
+            odometry_ns=np.array([o.stamp_ns for o in odometry], np.int64),
+            odom_T_child=from_quaternion(pose[:, :3], pose[:, 3:]) if len(pose) else np.zeros((0, 4, 4)),
+            twist=np.array([o.twist for o in odometry]).reshape(-1, 6),
+            imu_ns=np.array([m.stamp_ns for m in imu], np.int64),
+            gyro=np.array([m.gyro for m in imu]).reshape(-1, 3),
+            accel=np.array([m.accel for m in imu]).reshape(-1, 3),
+            fix_ns=np.array([f.stamp_ns for f in fixes], np.int64),
+            lat_lon_h=np.array([f.lat_lon_h for f in fixes]).reshape(-1, 3),
+            fix_cov=np.array([f.cov for f in fixes]).reshape(-1, 3, 3),
+            fix_status=np.array([f.status for f in fixes], np.int64),
+            heading_ns=np.array([h.stamp_ns for h in headings], np.int64),
+            heading=np.array([h.yaw for h in headings]),
+            heading_sigma=np.array([h.sigma for h in headings]),
+            frames=frames,
         )
 
 

@@ -20,7 +20,7 @@ TRACED = 1.75
 """Height up to which returns of a trunk are labelled as trunk, m."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sweep:
     """Returns of one sweep in firing order: xyz (N, 3) in the moving sensor's frame, ring, seconds since the
     sweep began, intensity, the tree hit (branches too; -1: none) and the material (-1: a mixed pixel)."""
@@ -70,11 +70,23 @@ def sweep(orchard: Orchard, config: SensorConfig, world_T_lidar: Array, time_s: 
     per_column = 1.0 / (config.sweep_hz * config.columns)
     time = (column + laser / (1.5 * len(angles))) * per_column
     ring = len(angles) - 1 - order[laser] if config.from_top else order[laser]
-    out = Sweep(xyz, ring.astype(np.uint16), time.astype(np.float32), intensity, tree, material)
+    out = Sweep(
+        xyz=xyz,
+        ring=ring.astype(np.uint16),
+        time=time.astype(np.float32),
+        intensity=intensity,
+        tree=tree,
+        material=material,
+    )
     if config.twice:
         every = np.repeat(np.arange(len(xyz)), 2)
         out = Sweep(
-            out.xyz[every], out.ring[every], out.time[every], out.intensity[every], out.tree[every], out.material[every]
+            xyz=out.xyz[every],
+            ring=out.ring[every],
+            time=out.time[every],
+            intensity=out.intensity[every],
+            tree=out.tree[every],
+            material=out.material[every],
         )
     return out
 

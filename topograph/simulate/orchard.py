@@ -13,7 +13,7 @@ from topograph.simulate.ground import Ground, lay_out
 from topograph.simulate.growth import Build, Shapes
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Orchard:
     """The scene and its trees (feet (N, 3) on the ground, axes (N, 3), diameters (N,), stems (N,)).
 

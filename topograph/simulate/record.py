@@ -71,9 +71,16 @@ def record(
             if progress is not None:
                 progress(min(1.0, (log_ns - start) / span))
     truth = Truth(
-        datum, scene.trees, scene.axes, scene.diameters, scene.stems, way.stamps_ns[::5], way.world_T_robot[::5],
-        np.array(scan_stamps, np.int64), np.array(seen, np.int32).reshape(len(scan_stamps), len(scene.trees)),
-    )  # fmt: skip
+        datum=datum,
+        trees=scene.trees,
+        axes=scene.axes,
+        diameters=scene.diameters,
+        stems=scene.stems,
+        stamps_ns=way.stamps_ns[::5],
+        world_T_robot=way.world_T_robot[::5],
+        scan_stamps_ns=np.array(scan_stamps, np.int64),
+        returns=np.array(seen, np.int32).reshape(len(scan_stamps), len(scene.trees)),
+    )
     truth.save(path.with_name(path.stem + ".truth"))
     return truth
 

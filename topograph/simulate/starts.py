@@ -88,7 +88,7 @@ class World:
     true: Array
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Step:
     """One scan: the true pose (3,), odometry's motion since the last (3,) in the robot's frame, its length, detections
     (N, 2) in the robot's frame, diameters (N,), and (N,) the tree of each, -1 for false ones."""
@@ -146,7 +146,7 @@ def drive(
     motion, distance = np.zeros(3), 0.0
     while True:
         p, diameter, source = _scan(w, tree, pose, c, rng)
-        yield Step(pose.copy(), motion, distance, p, diameter, source)
+        yield Step(pose=pose.copy(), motion=motion, distance=distance, p=p, diameter=diameter, source=source)
         if driven >= length - 1e-9:
             return
         if driven >= jump_at and not jumped:

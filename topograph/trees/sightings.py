@@ -12,7 +12,7 @@ from topograph.motion import Motion
 from topograph.trees.detections import Detections
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sightings:
     """M sightings.
 
@@ -94,7 +94,9 @@ class AtKeyframes:
         keep = np.flatnonzero(tree >= 0)
         if not len(keep):
             none = np.zeros(0, np.int64)
-            return Sightings(none, none, np.zeros((0, 3)), np.zeros((0, 3, 3)), none, np.zeros((0, 3)))
+            return Sightings(
+                keyframe=none, tree=none, p=np.zeros((0, 3)), cov=np.zeros((0, 3, 3)), count=none, late=np.zeros((0, 3))
+            )
         label = self.keyframe[keep] * (int(tree.max()) + 1) + tree[keep]
         order = np.argsort(label, kind="stable")
         first = np.flatnonzero(np.diff(label[order], prepend=-1))
@@ -108,7 +110,14 @@ class AtKeyframes:
         effective = 1 + independent * (count - 1)
         late = np.add.reduceat(self.late[rows], first) / count[:, None]
         rows = rows[first]
-        return Sightings(self.keyframe[rows], tree[rows], mean, cov * (count / effective)[:, None, None], count, late)
+        return Sightings(
+            keyframe=self.keyframe[rows],
+            tree=tree[rows],
+            p=mean,
+            cov=cov * (count / effective)[:, None, None],
+            count=count,
+            late=late,
+        )
 
 
 def gather(

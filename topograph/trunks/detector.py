@@ -190,5 +190,12 @@ def warm_up() -> None:
     xyz = np.concatenate(
         [np.stack([5 * np.cos(az), 5 * np.sin(az), np.full(600, -0.8 + 0.2 * k)], 1) for k in range(4)]
     )
-    scan = Scan(1, "lidar", xyz.astype(np.float32), np.repeat(np.arange(4), 600).astype(np.int32), None, None)
+    scan = Scan(
+        stamp_ns=1,
+        frame="lidar",
+        xyz=xyz.astype(np.float32),
+        ring=np.repeat(np.arange(4), 600).astype(np.int32),
+        offset=None,
+        intensity=None,
+    )
     Detector(np.eye(4), TrunksConfig())(scan, np.zeros(6))

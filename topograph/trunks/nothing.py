@@ -10,4 +10,13 @@ from topograph.bags import Trunks
 def none_at(stamp_ns: int) -> Trunks:
     """No trunks."""
     z = np.zeros(0)
-    return Trunks(stamp_ns, "base_link", np.zeros((0, 3)), np.zeros((0, 3)), z, np.zeros((0, 3, 3)), z, z)
+    return Trunks(
+        stamp_ns=stamp_ns,
+        frame="base_link",
+        p=np.zeros((0, 3)),
+        axis=np.zeros((0, 3)),
+        diameter=z,
+        cov=np.zeros((0, 3, 3)),
+        height=z,
+        score=z,
+    )

@@ -90,7 +90,9 @@ def once(scan: Scan) -> Scan:
     ring = None if scan.ring is None else scan.ring[:half]
     offset = None if scan.offset is None else scan.offset[:half]
     intensity = None if scan.intensity is None else scan.intensity[:half]
-    return Scan(scan.stamp_ns, scan.frame, scan.xyz[:half], ring, offset, intensity)
+    return Scan(
+        stamp_ns=scan.stamp_ns, frame=scan.frame, xyz=scan.xyz[:half], ring=ring, offset=offset, intensity=intensity
+    )
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)

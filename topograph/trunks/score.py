@@ -46,7 +46,7 @@ class Layers(NamedTuple):
     beside: list[NDArray[np.float32]]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Network:
     """The trained score.
 

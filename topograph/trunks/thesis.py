@@ -81,7 +81,18 @@ class ThesisDetector:
         cov = np.tile(np.diag([SURFACE_SIGMA**2, SURFACE_SIGMA**2, 0.3**2]), (n, 1, 1))
         up = np.tile([0.0, 0.0, 1.0], (n, 1))
         nothing = np.full(n, np.nan)
-        return Trunks(scan.stamp_ns, "base_link", p, up, nothing, cov, nothing, np.full(n, 2.0), clouds, surface=True)
+        return Trunks(
+            stamp_ns=scan.stamp_ns,
+            frame="base_link",
+            p=p,
+            axis=up,
+            diameter=nothing,
+            cov=cov,
+            height=nothing,
+            score=np.full(n, 2.0),
+            clouds=clouds,
+            surface=True,
+        )
 
     def filtered(self, scan: Scan) -> tuple[Array, Array]:
         """Algorithm 1: points (M, 3) in the LiDAR's frame that may be trunks, and their normals (M, 3)."""

@@ -325,7 +325,7 @@ def test_one_writer_at_a_time(tmp_path: Path) -> None:
         pass
     lock = tmp_path / ".m.gpkg.lock"
     lock.write_text("process 1 on another machine")  # its writer was killed
-    (tmp_path / ".m.gpkg.999999999.part").write_bytes(b"x")
+    (tmp_path / ".m.999999999.part.gpkg").write_bytes(b"x")
     with store.locked(path):
         store.save(make(3), path)
     assert [p.name for p in tmp_path.iterdir()] == ["m.gpkg"]

@@ -122,7 +122,7 @@ def save_thesis(
     from topograph.errors import InsufficientDataError
     from topograph.evaluate import truth_metrics, world_in_map, write_tum
     from topograph.evaluate.metrics import doubles
-    from topograph.report.record import write_text
+    from topograph.whole import write_text
 
     text = dump(config)
     meta = {"config": text, "inputs": json.dumps(inputs), "versions": json.dumps(versions()), "verdict": "not audited"}
@@ -182,8 +182,8 @@ def save_results(
     from topograph.config import dump
     from topograph.evaluate import truth_metrics, world_in_map, write_tum
     from topograph.evaluate.metrics import doubles, tree_errors
-    from topograph.report.record import write_text
     from topograph.report.viewer import write_viewer
+    from topograph.whole import write_text
 
     began = time.perf_counter()
     write_tum(folder / "path.tum", solved.estimate.stamps_ns, solved.estimate.map_T_robot)
@@ -279,7 +279,7 @@ def detect(
     from topograph import pipeline, report
     from topograph.evaluate import Metric, trunk_metrics
     from topograph.geometry import inverse, transform
-    from topograph.report.record import write_text
+    from topograph.whole import write_text
 
     config = config_of(config_file, words)
     true = truth_of(truth)

@@ -157,7 +157,7 @@ def _keep(folder: Path, c: Any, config: Any, **more: Any) -> None:
     """The configuration and `metrics.json` beside the page."""
     from topograph.config import dump
     from topograph.report.comparison import records
-    from topograph.report.record import write_text
+    from topograph.whole import write_text
 
     write_text(folder / "config.yaml", dump(config))
     record = {"metrics": records(c), "notes": c.notes, **more, "versions": versions()}

@@ -57,8 +57,8 @@ def localize(
     from topograph.exchange import write_wide_tum
     from topograph.geometry import interpolate, tangent_cov
     from topograph.report import Page, localization_error_figure, localization_figure, write_json
-    from topograph.report.record import write_text
     from topograph.report.viewer import localization_data, write_viewer
+    from topograph.whole import write_text
 
     if not 0.0 <= from_s < to_s:
         raise UsageError(f"--from {from_s} --to {to_s}: nothing lies between")

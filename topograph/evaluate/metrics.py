@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,18 @@ class Metric:
     value: float
     unit: str = ""
     better: str = ""
+
+    @property
+    def plain(self) -> float | int | None:
+        """The value as JSON has it."""
+        return plain(self.value)
+
+
+def plain(value: float) -> float | int | None:
+    """A number as JSON has it: None for what is none, whole ones without a point."""
+    if not math.isfinite(value):
+        return None
+    return int(value) if float(value).is_integer() and abs(value) < 1e15 else float(value)
 
 
 def match(found: Array, true: Array, gate: float = MATCH_GATE) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

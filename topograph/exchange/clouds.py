@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from topograph.errors import UsageError
-from topograph.exchange.whole import whole
 from topograph.topomap import TopoMap
+from topograph.whole import whole
 
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("tree", "<u4")])
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 from topograph.exchange.attributes import columns
-from topograph.exchange.whole import whole
 from topograph.topomap import TopoMap
+from topograph.whole import whole
 
 GRAPHML = "http://graphml.graphdrawing.org/xmlns"
 TYPES = {int: "long", float: "double", str: "string"}

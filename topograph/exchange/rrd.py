@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from topograph.errors import UsageError
-from topograph.exchange.whole import whole
 from topograph.topomap import KINDS, TopoMap
+from topograph.whole import whole
 
 COLORS = {"tree": (27, 120, 55), "post": (123, 92, 62)}
 TRUNK_M = 1.5

@@ -12,8 +12,8 @@ from topograph.exchange.ros import write_ros
 from topograph.exchange.rrd import write_rrd
 from topograph.exchange.tables import write_csv, write_geojson, write_kml, write_parquet
 from topograph.exchange.tum import write_tum
-from topograph.exchange.whole import whole
 from topograph.topomap import TopoMap
+from topograph.whole import whole
 
 
 def _path(topo: TopoMap, path: Path) -> None:

@@ -13,9 +13,9 @@ import numpy as np
 
 from topograph.errors import InputError, UsageError
 from topograph.exchange.attributes import columns
-from topograph.exchange.whole import whole
 from topograph.geometry import Datum
 from topograph.topomap import TopoMap
+from topograph.whole import whole
 
 
 def write_csv(topo: TopoMap, path: Path) -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -15,8 +14,6 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from topograph.config import Config, dump
 from topograph.errors import TopographError
@@ -26,6 +23,7 @@ from topograph.evaluate.statistics import paired_ratio
 from topograph.mapping import Progress, silent
 from topograph.pipeline.comparing import compare_runs
 from topograph.simulate import DriveConfig, SensorConfig, record
+from topograph.whole import write_text
 
 AT_STOPS_M = 2.0
 """Between two stops, as in the thesis (5.3)."""
@@ -95,18 +93,12 @@ def _do(job: Job, folder: Path, config: Config) -> None:
             "table": r.table,
             "name": r.name,
             "run": r.run,
-            "metrics": [[m.name, _plain(m.value), m.unit, m.better] for m in r.metrics],
+            "metrics": [[m.name, m.plain, m.unit, m.better] for m in r.metrics],
         }
         for r in c.rows
     ]
     text = json.dumps({"job": job.name, "rows": rows, "notes": c.notes}, allow_nan=False)
-    part = _file(folder, job, config).with_suffix(f".{os.getpid()}.part")
-    part.write_text(text)
-    part.replace(_file(folder, job, config))
-
-
-def _plain(v: float) -> float | None:
-    return float(v) if np.isfinite(v) else None
+    write_text(_file(folder, job, config), text)
 
 
 def together(jobs: Sequence[Job], folder: Path, config: Config) -> Comparison:

@@ -12,10 +12,11 @@ import numpy as np
 
 from topograph.evaluate import Metric
 from topograph.evaluate.comparison import Comparison, Figure, wrong_starts
+from topograph.evaluate.metrics import plain
 from topograph.report.chapter5 import figures
 from topograph.report.page import show
-from topograph.report.record import write_text
 from topograph.report.templates import render
+from topograph.whole import write_text
 
 ABOUT = {
     "5.1 a sweep": (
@@ -153,18 +154,14 @@ def records(c: Comparison) -> list[dict[str, Any]]:
     return [
         {
             "key": f"{f.table}/{f.name}/{f.metric}",
-            "value": _plain(f.value),
+            "value": plain(f.value),
             "unit": f.unit,
             "direction": f.better,
             "n": f.n,
-            "interval": [_plain(f.low), _plain(f.high)],
+            "interval": [plain(f.low), plain(f.high)],
         }
         for f in c.summary()
     ]
-
-
-def _plain(v: float) -> float | None:
-    return float(v) if np.isfinite(v) else None
 
 
 def said_of(c: Comparison) -> list[str]:

@@ -11,8 +11,8 @@ import numpy as np
 
 from topograph.audit import Finding
 from topograph.evaluate import Metric
-from topograph.report.record import write_text
 from topograph.report.templates import render
+from topograph.whole import write_text
 
 ABOUT = {
     "Map": "Ellipses: 95 %, ten times enlarged.",

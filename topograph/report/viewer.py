@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from topograph.errors import InputError
 from topograph.geometry import Array
 from topograph.localize import row_direction
-from topograph.report.record import write_text
 from topograph.report.templates import render
 from topograph.topomap import TopoMap
+from topograph.whole import write_text
 
 MOST_CLOUD_BYTES = 3_000_000
 """Of all clouds in a self-contained page; they are thinned alike until they fit."""

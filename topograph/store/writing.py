@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import sqlite3
 import zlib
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from topograph.store.layers import add_layers
 from topograph.store.lock import sweep
 from topograph.store.schema import ATTRIBUTES, FEATURES, SCHEMA_VERSION, TABLES, WGS84, geometry, lon_lat, real
 from topograph.topomap import KINDS, TopoMap
+from topograph.whole import whole
 
 
 def save(topo: TopoMap, path: Path) -> None:
@@ -24,13 +25,10 @@ def save(topo: TopoMap, path: Path) -> None:
     Raises:
         MapError: the folder cannot be written.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part.unlink(missing_ok=True)
         sweep(path)
-        connection = sqlite3.connect(part)
-        try:
+        with whole(path) as part, closing(sqlite3.connect(part)) as connection:
             connection.execute("PRAGMA journal_mode=DELETE")
             connection.execute("PRAGMA synchronous=FULL")
             connection.execute(f"PRAGMA application_id={0x47504B47}")
@@ -41,13 +39,8 @@ def save(topo: TopoMap, path: Path) -> None:
                 add_layers(connection, topo, _srs(topo))
                 digests = [(f"digest:{t}", digest(connection, t)) for t in DIGESTED]
                 connection.executemany("INSERT INTO meta (key, value) VALUES (?,?)", digests)
-        finally:
-            connection.close()
-        os.replace(part, path)
     except (OSError, sqlite3.Error) as err:
         raise MapError(f"{path}: cannot be written ({err})") from err
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _srs(t: TopoMap) -> int:

@@ -48,7 +48,7 @@ BREAKS = [
     Break("heading sigma from the roll entry", T + "bags/decode.py", "np.asarray(m.orientation_covariance)[8]", "np.asarray(m.orientation_covariance)[0]", P + "test_bags.py"),
     Break("stamps of the future are taken", T + "bags/clocks.py", "ODD_NS = 2_000_000_000", "ODD_NS = 10**18", P + "test_bags.py"),
     Break("announced messages are not missed", T + "bags/recording.py", "if self.counts[topic] > self.given[kind]:", "if False:", P + "test_bags.py"),
-    Break("gravity filter pushes the wrong way", T + "motion/reckon.py", "wx += (fy * uz - fz * uy) / tau[k]", "wx -= (fy * uz - fz * uy) / tau[k]", P + "test_motion.py"),
+    Break("gravity filter pushes the wrong way", T + "motion/gravity_kernel.py", "wx += (fy * uz - fz * uy) / tau[k]", "wx -= (fy * uz - fz * uy) / tau[k]", P + "test_motion.py"),
     Break("half an arc forgotten", T + "motion/reckon.py", "half = exp(0.5 * log(step))", "half = exp(0.0 * log(step))", P + "test_motion.py"),
     Break("slips are left in", T + "motion/wheels.py", "factor = np.full(steps, scale)", "return nothing\n    factor = np.full(steps, scale)", P + "test_motion.py"),
     Break("slip's doubt forgotten", T + "motion/wheels.py", "SLIP_SIGMA = 0.3", "SLIP_SIGMA = 0.0", P + "test_motion.py"),

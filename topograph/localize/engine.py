@@ -6,17 +6,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from topograph.geometry import Array
 from topograph.localize.config import LocalizeConfig
 from topograph.localize.evidence import Posterior, describe, nothing, weigh
 from topograph.localize.filter import Filter
+from topograph.localize.filter_kernels import assign, in_view
 from topograph.localize.hypothesis import DRAGGED, Hypothesis
 from topograph.localize.index import MapIndex
 from topograph.localize.search import Found, Landmarks, search, searching
-from topograph.localize.submap import BINS, Move, Submap, Sweep, Visibility, absorb, assign, in_reach, in_view, sectors
+from topograph.localize.search_kernels import within_kernel
+from topograph.localize.submap import BINS, Move, Submap, Sweep, Visibility, absorb, in_reach, sectors
 
 ASTRAY = 0.3
 """Deviation of a tree's place in the middle of the view, in mean spacings of trees, beyond which it is searched anew."""
@@ -304,7 +305,7 @@ class Engine:
     def near(self, xy: Array, reach: float) -> NDArray[np.int64]:
         """Rows of mapped trees within `reach` of a place."""
         i = self.index
-        return np.asarray(_within(xy, reach, i.xy, i.origin, i.bucket, i.buckets, i.start, i.member))
+        return np.asarray(within_kernel(xy, reach, i.xy, i.origin, i.bucket, i.buckets, i.start, i.member))
 
     def _suspect(
         self, f: Filter, z: Array, m2: Array, logdet: Array, match: NDArray[np.int64], found: NDArray[np.bool_],
@@ -430,30 +431,3 @@ def anchored(hunt: _Hunt, index: MapIndex, config: LocalizeConfig) -> Filter:
             f.tree[k] = t
     f.mean[2] = (f.mean[2] + np.pi) % (2 * np.pi) - np.pi
     return f
-
-
-@njit(cache=True)
-def _within(at, reach, xy, origin, bucket, buckets, start, member):
-    out = np.empty(64, np.int64)
-    n = 0
-    x0, x1 = (
-        int(max(0.0, (at[0] - reach - origin[0]) / bucket)),
-        int(min(buckets[0] - 1.0, (at[0] + reach - origin[0]) / bucket)),
-    )
-    y0, y1 = (
-        int(max(0.0, (at[1] - reach - origin[1]) / bucket)),
-        int(min(buckets[1] - 1.0, (at[1] + reach - origin[1]) / bucket)),
-    )
-    for bx in range(x0, x1 + 1):
-        for by in range(y0, y1 + 1):
-            cell = bx * buckets[1] + by
-            for q in range(start[cell], start[cell + 1]):
-                t = member[q]
-                if (xy[t, 0] - at[0]) ** 2 + (xy[t, 1] - at[1]) ** 2 <= reach * reach:
-                    if n == len(out):
-                        more = np.empty(2 * n, np.int64)
-                        more[:n] = out
-                        out = more
-                    out[n] = t
-                    n += 1
-    return out[:n].copy()

@@ -7,10 +7,10 @@ covariance at every step; a graph would have to be marginalised for it each time
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from topograph.geometry import Array
+from topograph.localize.filter_kernels import add_kernel, fix_kernel, innovations_kernel, predict_kernel, update_kernel
 
 
 class Filter:
@@ -78,22 +78,22 @@ class Filter:
 
     def predict(self, move: Array, cov: Array, distance: float) -> None:
         """Move by (x, y, yaw) in the robot's own plane, with covariance (3, 3)."""
-        _predict(self._mean, self._cov, 3 + 2 * self.n, move, cov)
+        predict_kernel(self._mean, self._cov, 3 + 2 * self.n, move, cov)
         self.run += distance
 
     def innovations(self, z: Array, R: Array) -> tuple[Array, Array]:
         """Squared Mahalanobis distances (N, n) of detections to landmarks, and log determinants of their S (N, n)."""
-        m2, logdet = _innovations(self._mean, self._cov, self.n, z, R)
+        m2, logdet = innovations_kernel(self._mean, self._cov, self.n, z, R)
         return m2, logdet
 
     def update(self, k: int, z: Array, R: Array) -> tuple[float, float]:
         """Sight landmark `k` at `z` (2,) in the robot's plane; returns chi-square and log |S| of the innovation."""
-        out = _update(self._mean, self._cov, 3 + 2 * self.n, k, z, R)
+        out = update_kernel(self._mean, self._cov, 3 + 2 * self.n, k, z, R)
         return float(out[0]), float(out[1])
 
     def fix(self, k: int, place: Array, cov: Array) -> None:
         """Landmark `k` is known to be at `place` (2,) with covariance (2, 2)."""
-        _fix(self._mean, self._cov, 3 + 2 * self.n, k, place, cov)
+        fix_kernel(self._mean, self._cov, 3 + 2 * self.n, k, place, cov)
 
     def count(self, k: int, diameter: float, diameter_var: float, reach: float) -> None:
         """Bookkeeping of a sighting."""
@@ -109,7 +109,7 @@ class Filter:
     def add(self, z: Array, R: Array) -> int:
         """A new landmark seen at `z` (2,) in the robot's plane."""
         k = self._room()
-        _add(self._mean, self._cov, 3 + 2 * k, z, R)
+        add_kernel(self._mean, self._cov, 3 + 2 * k, z, R)
         return k
 
     def place(self, xy: Array, cov: Array, tree: int) -> int:
@@ -182,125 +182,3 @@ class Filter:
         J[[1, *range(4, d, 2)], 2] = points[:, 0] - centre[0]
         out._cov[:d, :d] = G @ self.cov @ G.T + (J * slack**2) @ J.T
         return out
-
-
-@njit(cache=True)
-def _predict(mean, cov, d, move, q):
-    c, s = np.cos(mean[2]), np.sin(mean[2])
-    dx = c * move[0] - s * move[1]
-    dy = s * move[0] + c * move[1]
-    mean[0] += dx
-    mean[1] += dy
-    mean[2] += move[2]
-    for j in range(d):  # F = [[1, 0, -dy], [0, 1, dx], [0, 0, 1]]
-        cov[0, j] -= dy * cov[2, j]
-        cov[1, j] += dx * cov[2, j]
-    for j in range(d):
-        cov[j, 0] -= dy * cov[j, 2]
-        cov[j, 1] += dx * cov[j, 2]
-    # Noise is given in the robot's frame before the step.
-    a = c * c * q[0, 0] + s * s * q[1, 1] - 2 * c * s * q[0, 1]
-    b = s * s * q[0, 0] + c * c * q[1, 1] + 2 * c * s * q[0, 1]
-    o = c * s * (q[0, 0] - q[1, 1]) + (c * c - s * s) * q[0, 1]
-    cov[0, 0] += a
-    cov[1, 1] += b
-    cov[0, 1] += o
-    cov[1, 0] += o
-    cov[2, 2] += q[2, 2]
-    ux = c * q[0, 2] - s * q[1, 2]
-    uy = s * q[0, 2] + c * q[1, 2]
-    cov[0, 2] += ux
-    cov[2, 0] += ux
-    cov[1, 2] += uy
-    cov[2, 1] += uy
-
-
-@njit(cache=True)
-def _innovations(mean, cov, n, z, R):
-    m2 = np.empty((len(z), n))
-    logdet = np.empty((len(z), n))
-    c, s = np.cos(mean[2]), np.sin(mean[2])
-    for k in range(n):
-        a = 3 + 2 * k
-        ex, ey = mean[a] - mean[0], mean[a + 1] - mean[1]
-        hx, hy = c * ex + s * ey, -s * ex + c * ey
-        # H over (x, y, yaw, lx, ly)
-        S00, S01, S11 = _project(cov, a, c, s, hx, hy)
-        for i in range(len(z)):
-            p, q, r = S00 + R[i, 0, 0], S01 + R[i, 0, 1], S11 + R[i, 1, 1]
-            det = p * r - q * q
-            vx, vy = z[i, 0] - hx, z[i, 1] - hy
-            m2[i, k] = (vx * vx * r - 2 * vx * vy * q + vy * vy * p) / det
-            logdet[i, k] = np.log(det)
-    return m2, logdet
-
-
-@njit(cache=True)
-def _project(cov, a, c, s, hx, hy):
-    H = np.empty((2, 5))
-    H[0, 0], H[0, 1], H[0, 2], H[0, 3], H[0, 4] = -c, -s, hy, c, s
-    H[1, 0], H[1, 1], H[1, 2], H[1, 3], H[1, 4] = s, -c, -hx, -s, c
-    index = np.array([0, 1, 2, a, a + 1])
-    out = np.zeros(3)
-    for i in range(5):
-        for j in range(5):
-            v = cov[index[i], index[j]]
-            out[0] += H[0, i] * v * H[0, j]
-            out[1] += H[0, i] * v * H[1, j]
-            out[2] += H[1, i] * v * H[1, j]
-    return out[0], out[1], out[2]
-
-
-@njit(cache=True)
-def _update(mean, cov, d, k, z, R):
-    a = 3 + 2 * k
-    c, s = np.cos(mean[2]), np.sin(mean[2])
-    ex, ey = mean[a] - mean[0], mean[a + 1] - mean[1]
-    hx, hy = c * ex + s * ey, -s * ex + c * ey
-    PH = np.empty((d, 2))
-    for j in range(d):
-        PH[j, 0] = -c * cov[j, 0] - s * cov[j, 1] + hy * cov[j, 2] + c * cov[j, a] + s * cov[j, a + 1]
-        PH[j, 1] = s * cov[j, 0] - c * cov[j, 1] - hx * cov[j, 2] - s * cov[j, a] + c * cov[j, a + 1]
-    p = -c * PH[0, 0] - s * PH[1, 0] + hy * PH[2, 0] + c * PH[a, 0] + s * PH[a + 1, 0] + R[0, 0]
-    q = -c * PH[0, 1] - s * PH[1, 1] + hy * PH[2, 1] + c * PH[a, 1] + s * PH[a + 1, 1] + R[0, 1]
-    r = s * PH[0, 1] - c * PH[1, 1] - hx * PH[2, 1] - s * PH[a, 1] + c * PH[a + 1, 1] + R[1, 1]
-    return _gain(mean, cov, d, PH, p, q, r, z[0] - hx, z[1] - hy)
-
-
-@njit(cache=True)
-def _fix(mean, cov, d, k, place, C):
-    a = 3 + 2 * k
-    PH = cov[:d, a : a + 2].copy()
-    p, q, r = cov[a, a] + C[0, 0], cov[a, a + 1] + C[0, 1], cov[a + 1, a + 1] + C[1, 1]
-    return _gain(mean, cov, d, PH, p, q, r, place[0] - mean[a], place[1] - mean[a + 1])
-
-
-@njit(cache=True)
-def _gain(mean, cov, d, PH, p, q, r, vx, vy):
-    det = p * r - q * q
-    ip, iq, ir = r / det, -q / det, p / det
-    wx, wy = ip * vx + iq * vy, iq * vx + ir * vy
-    for i in range(d):
-        k0 = PH[i, 0] * ip + PH[i, 1] * iq
-        k1 = PH[i, 0] * iq + PH[i, 1] * ir
-        mean[i] += PH[i, 0] * wx + PH[i, 1] * wy
-        for j in range(d):
-            cov[i, j] -= k0 * PH[j, 0] + k1 * PH[j, 1]
-    return vx * wx + vy * wy, np.log(det)
-
-
-@njit(cache=True)
-def _add(mean, cov, a, z, R):
-    c, s = np.cos(mean[2]), np.sin(mean[2])
-    gx, gy = c * z[0] - s * z[1], s * z[0] + c * z[1]
-    mean[a] = mean[0] + gx
-    mean[a + 1] = mean[1] + gy
-    for j in range(a):
-        cov[a, j] = cov[0, j] - gy * cov[2, j]
-        cov[a + 1, j] = cov[1, j] + gx * cov[2, j]
-        cov[j, a] = cov[a, j]
-        cov[j, a + 1] = cov[a + 1, j]
-    cov[a, a] = cov[a, 0] - gy * cov[a, 2] + c * c * R[0, 0] + s * s * R[1, 1] - 2 * c * s * R[0, 1]
-    cov[a + 1, a + 1] = cov[a + 1, 1] + gx * cov[a + 1, 2] + s * s * R[0, 0] + c * c * R[1, 1] + 2 * c * s * R[0, 1]
-    cov[a, a + 1] = cov[a, 1] + gx * cov[a, 2] + c * s * (R[0, 0] - R[1, 1]) + (c * c - s * s) * R[0, 1]
-    cov[a + 1, a] = cov[a, a + 1]

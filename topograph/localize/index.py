@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from topograph.geometry import Array
+from topograph.localize.search_kernels import fill_kernel
 
 DIAMETER_NOISE = 0.02
 """Standard deviation of a mapped diameter, m: orchards whose diameters vary no more than this are all alike."""
@@ -92,7 +92,7 @@ def build_index(
         cell *= 1.4
     shape = np.ceil((high - low) / cell).astype(int) + 1
     nearest = np.full(shape, -1, np.int32)
-    _fill(nearest, xy, low, cell, int(np.ceil(0.5 * gap / cell)) + 1)
+    fill_kernel(nearest, xy, low, cell, int(np.ceil(0.5 * gap / cell)) + 1)
     bucket = max(6.0, gap)
     while np.prod((high - low) / bucket) > max(1e5, 4.0 * n):
         bucket *= 1.5
@@ -150,22 +150,6 @@ def _spread(diameter: Array) -> float:
     if len(diameter) < 2:
         return 0.0
     return float(np.sqrt(max(float(np.var(diameter)) - DIAMETER_NOISE**2, 0.0)))
-
-
-@njit(cache=True)
-def _fill(nearest, xy, low, cell, reach):
-    best = np.full(nearest.shape, 1e18, np.float32)
-    for t in range(len(xy)):
-        cx = int((xy[t, 0] - low[0]) / cell)
-        cy = int((xy[t, 1] - low[1]) / cell)
-        for i in range(max(cx - reach, 0), min(cx + reach + 1, nearest.shape[0])):
-            for j in range(max(cy - reach, 0), min(cy + reach + 1, nearest.shape[1])):
-                dx = low[0] + (i + 0.5) * cell - xy[t, 0]
-                dy = low[1] + (j + 0.5) * cell - xy[t, 1]
-                d = dx * dx + dy * dy
-                if d < best[i, j]:
-                    best[i, j] = d
-                    nearest[i, j] = t
 
 
 def _jitter(tree: cKDTree, xy: Array, var: Array, gap: float, sample: int = 2000) -> float:

@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from topograph.geometry import Array
 from topograph.localize.config import LocalizeConfig
 from topograph.localize.filter import Filter
+from topograph.localize.filter_kernels import assign, enter_kernel, in_view
 
 BINS = np.array([5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 60.0])
 
@@ -148,7 +148,7 @@ class Submap:
             more = 40
             self.raster = np.pad(self.raster, more)
             self.origin = self.origin - more
-        _enter(self.raster, self.origin, x, y, yaw, blocked, np.append(BINS, 1e9), self.visibility.table(), reach)
+        enter_kernel(self.raster, self.origin, x, y, yaw, blocked, np.append(BINS, 1e9), self.visibility.table(), reach)
 
 
 def in_reach(sweep: Sweep, config: LocalizeConfig) -> tuple[Sweep, NDArray[np.int64]]:
@@ -171,29 +171,6 @@ def absorb(f: Filter, seen: Sweep, m2: Array, match: NDArray[np.int64], gate: fl
         f.count(k, seen.diameter[i], seen.diameter_var[i], float(np.hypot(*seen.p[i])))
 
 
-@njit(cache=True)
-def assign(m2, logdet, gate):
-    """Landmark (N,) of each detection, -1 none: best pairs first, each landmark once.
-
-    A pair's cost is its chi-square plus ln |S|: a landmark that is badly known does not take every detection.
-    """
-    n, k = m2.shape
-    out = np.full(n, -1, np.int64)
-    taken = np.zeros(k, np.bool_)
-    while True:
-        best, bi, bk = 1e18, -1, -1
-        for i in range(n):
-            if out[i] >= 0:
-                continue
-            for j in range(k):
-                if not taken[j] and m2[i, j] < gate and m2[i, j] + logdet[i, j] < best:
-                    best, bi, bk = m2[i, j] + logdet[i, j], i, j
-        if bi < 0:
-            return out
-        out[bi] = bk
-        taken[bk] = True
-
-
 def sectors(z: Array, n: int = 180) -> Array:
     """Range (n,) of the nearest trunk by bearing; infinity where the view is free."""
     out = np.full(n, np.inf)
@@ -202,35 +179,3 @@ def sectors(z: Array, n: int = 180) -> Array:
         at = ((np.arctan2(z[:, 1], z[:, 0]) + np.pi) * (n / (2 * np.pi))).astype(int) % n
         np.minimum.at(out, at, reach)
     return out
-
-
-@njit(cache=True)
-def in_view(mean, n, blocked):
-    """Range (n,) of each landmark and whether a nearer trunk hides it."""
-    reach = np.empty(n)
-    hidden = np.zeros(n, np.bool_)
-    s = len(blocked)
-    for k in range(n):
-        dx, dy = mean[3 + 2 * k] - mean[0], mean[4 + 2 * k] - mean[1]
-        reach[k] = np.hypot(dx, dy)
-        at = int((np.arctan2(dy, dx) - mean[2]) * s / (2 * np.pi) + 1.5 * s) % s
-        hidden[k] = blocked[at] < reach[k] - 1.0
-    return reach, hidden
-
-
-@njit(cache=True)
-def _enter(raster, origin, x, y, yaw, blocked, bins, chance, view):
-    s = len(blocked)
-    for i in range(max(0, int(x - view - origin[0])), min(raster.shape[0], int(x + view - origin[0]) + 1)):
-        for j in range(max(0, int(y - view - origin[1])), min(raster.shape[1], int(y + view - origin[1]) + 1)):
-            dx, dy = origin[0] + i + 0.5 - x, origin[1] + j + 0.5 - y
-            r = np.sqrt(dx * dx + dy * dy)
-            if r > view:
-                continue
-            at = int((np.arctan2(dy, dx) - yaw) * s / (2 * np.pi) + 1.5 * s) % s
-            if blocked[at] < r - 1.0:
-                continue
-            b = 0
-            while r > bins[b]:
-                b += 1
-            raster[i, j] -= np.log(1.0 - chance[b])

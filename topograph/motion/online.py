@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from topograph.bags import Imu, Odometry
 from topograph.geometry import Array, exp, from_quaternion, inverse, log
 from topograph.motion.against import Against
+from topograph.motion.gravity_kernel import gravity_kernel
 from topograph.motion.inertial import GRAVITY
-from topograph.motion.reckon import _filter, _quaternion_of
+from topograph.motion.reckon import quaternion_of
 from topograph.motion.samples import RANGE
 
 AHEAD_NS = 2_000_000_000
@@ -370,7 +371,7 @@ class Reckoner:
         force[:, 1] -= speed * rate[:, 2]
         dt = np.diff(stamps) * 1e-9
         tau = np.clip(a.age + np.cumsum(dt), 0.5, self.tilt_time_s)
-        q = _filter(a.q, rate, force, np.minimum(dt, 1e-9 * GYRO_GAP_NS), tau, GRAVITY)
+        q = gravity_kernel(a.q, rate, force, np.minimum(dt, 1e-9 * GYRO_GAP_NS), tau, GRAVITY)
         fade = float(np.exp(-np.sum(dt / tau)))
         sigma = float(np.hypot(LEVEL_SIGMA, a.sigma * fade)) if covered else MOVING_SIGMA
         self._attitude = _Attitude(stamp_ns, q[-1], a.age + float(dt.sum()), sigma)
@@ -402,7 +403,7 @@ class Reckoner:
         still = bool(np.abs(speed).max(initial=0.0) < REST[0]) and bool(np.abs(rate).max() < 0.1)
         sigma = 2 * LEVEL_SIGMA if still else MOVING_SIGMA
         roll, pitch = float(np.arctan2(f[1], f[2])), float(np.arctan2(-f[0], np.hypot(f[1], f[2])))
-        self._attitude = _Attitude(int(stamps[0]), _quaternion_of(roll, pitch), 0.0, sigma)
+        self._attitude = _Attitude(int(stamps[0]), quaternion_of(roll, pitch), 0.0, sigma)
         return True
 
 

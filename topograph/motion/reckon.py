@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numba import njit
 from scipy.ndimage import gaussian_filter1d
 
 from topograph.geometry import (
@@ -20,6 +19,7 @@ from topograph.geometry import (
     wrap,
     yaw_of,
 )
+from topograph.motion.gravity_kernel import gravity_kernel
 from topograph.motion.inertial import GRAVITY, Inertial
 from topograph.motion.wheels import against_fixes
 from topograph.ranges import Positive
@@ -297,49 +297,11 @@ def _attitude(inertial: Inertial, speed: Array | None, config: MotionConfig) -> 
         force[:, 1] -= speed * rate[:, 2]
     first = np.mean(force[: max(5, int(1.0 / max(float(np.median(dt)), 1e-3)))], axis=0)
     roll, pitch = np.arctan2(first[1], first[2]), np.arctan2(-first[0], np.hypot(first[1], first[2]))
-    q0 = _quaternion_of(float(roll), float(pitch))
-    q = _filter(q0, rate, force, dt.clip(0, 0.2), np.full(len(dt), config.tilt_time_s), GRAVITY)
+    q0 = quaternion_of(float(roll), float(pitch))
+    q = gravity_kernel(q0, rate, force, dt.clip(0, 0.2), np.full(len(dt), config.tilt_time_s), GRAVITY)
     return from_quaternion(np.zeros((len(q), 3)), q)[:, :3, :3]
 
 
-def _quaternion_of(roll: float, pitch: float) -> Array:
+def quaternion_of(roll: float, pitch: float) -> Array:
     a, b = roll / 2, pitch / 2
     return np.array([np.sin(a) * np.cos(b), np.cos(a) * np.sin(b), -np.sin(a) * np.sin(b), np.cos(a) * np.cos(b)])
-
-
-@njit(cache=True)
-def _filter(q0, rate, force, dt, tau, gravity):
-    n = len(rate)
-    out = np.empty((n, 4))
-    x, y, z, w = q0
-    out[0] = q0
-    for k in range(n - 1):
-        h = dt[k]
-        wx = 0.5 * (rate[k, 0] + rate[k + 1, 0])
-        wy = 0.5 * (rate[k, 1] + rate[k + 1, 1])
-        wz = 0.5 * (rate[k, 2] + rate[k + 1, 2])
-        f = force[k]
-        size = np.sqrt(f[0] ** 2 + f[1] ** 2 + f[2] ** 2)
-        if abs(size - gravity) < 1.5:
-            # Up as the attitude has it, in the body; its cross product with the force turns one onto the other.
-            ux, uy, uz = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-            fx, fy, fz = f[0] / size, f[1] / size, f[2] / size
-            # A turn by up x force would move the body's measured up onto the predicted one.
-            wx += (fy * uz - fz * uy) / tau[k]
-            wy += (fz * ux - fx * uz) / tau[k]
-            wz += (fx * uy - fy * ux) / tau[k]
-        rx, ry, rz = wx * h, wy * h, wz * h
-        a = np.sqrt(rx * rx + ry * ry + rz * rz)
-        s = np.sin(a / 2) / a if a > 1e-12 else 0.5
-        c = np.cos(a / 2)
-        dx, dy, dz = rx * s, ry * s, rz * s
-        x, y, z, w = (
-            w * dx + x * c + y * dz - z * dy,
-            w * dy - x * dz + y * c + z * dx,
-            w * dz + x * dy - y * dx + z * c,
-            w * c - x * dx - y * dy - z * dz,
-        )
-        norm = np.sqrt(x * x + y * y + z * z + w * w)
-        x, y, z, w = x / norm, y / norm, z / norm, w / norm
-        out[k + 1, 0], out[k + 1, 1], out[k + 1, 2], out[k + 1, 3] = x, y, z, w
-    return out

@@ -1,0 +1,209 @@
+"""The search for placements, compiled. numba types the arguments by itself."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True)
+def fill_kernel(nearest, xy, low, cell, reach):
+    best = np.full(nearest.shape, 1e18, np.float32)
+    for t in range(len(xy)):
+        cx = int((xy[t, 0] - low[0]) / cell)
+        cy = int((xy[t, 1] - low[1]) / cell)
+        for i in range(max(cx - reach, 0), min(cx + reach + 1, nearest.shape[0])):
+            for j in range(max(cy - reach, 0), min(cy + reach + 1, nearest.shape[1])):
+                dx = low[0] + (i + 0.5) * cell - xy[t, 0]
+                dy = low[1] + (j + 0.5) * cell - xy[t, 1]
+                d = dx * dx + dy * dy
+                if d < best[i, j]:
+                    best[i, j] = d
+                    nearest[i, j] = t
+
+
+@njit(cache=True, fastmath=True)
+def seed_kernel(
+    m,
+    var,
+    dia,
+    dia_var,
+    other,
+    order,
+    pa,
+    pb,
+    xy,
+    tvar,
+    tdia,
+    dmean,
+    dsd,
+    origin,
+    cell,
+    nearest,
+    best,
+    bound,
+    map_sigma,
+):
+    n = len(m)
+    out = np.empty((1024, 3))
+    losses = np.empty(1024)
+    count = 0
+    i, j = order[0], order[1]
+    base = map_sigma * map_sigma
+    volume = np.empty(n)
+    floor = np.empty(n)  # the least that a landmark can cost: then a running loss only rises
+    for q in range(n):
+        volume[q] = np.log(2 * np.pi * (var[q] + base))
+        floor[q] = min(-other[q], volume[q])
+    ex, ey = m[j, 0] - m[i, 0], m[j, 1] - m[i, 1]
+    for s in range(2 * len(pa)):
+        if s % 2 == 0:
+            a, b = pa[s // 2], pb[s // 2]
+        else:
+            b, a = pa[s // 2], pb[s // 2]
+        # Weighted means and moments of the matches so far (Horn's closed form in the plane).
+        wi, wj = 1.0 / (var[i] + base + tvar[a]), 1.0 / (var[j] + base + tvar[b])
+        W = wi + wj
+        mx, my = (wi * m[i, 0] + wj * m[j, 0]) / W, (wi * m[i, 1] + wj * m[j, 1]) / W
+        tx, ty = (wi * xy[a, 0] + wj * xy[b, 0]) / W, (wi * xy[a, 1] + wj * xy[b, 1]) / W
+        fx, fy = xy[b, 0] - xy[a, 0], xy[b, 1] - xy[a, 1]
+        w2 = wi * wj / W
+        dot, cross = w2 * (ex * fx + ey * fy), w2 * (ex * fy - ey * fx)
+        inertia = w2 * (ex * ex + ey * ey)
+        h = np.sqrt(dot * dot + cross * cross)
+        c, sn = dot / h, cross / h
+        loss = diameter_kernel(dia[i], dia_var[i], tdia[a], dmean, dsd) + diameter_kernel(
+            dia[j], dia_var[j], tdia[b], dmean, dsd
+        )
+        gap = np.sqrt(fx * fx + fy * fy) - np.sqrt(ex * ex + ey * ey)
+        loss += 3.0 * np.log(1.0 + gap * gap * w2 / 4.0)
+        loss += volume[i] - floor[i] + volume[j] - floor[j]
+        u0, u1 = a, b
+        for o in range(2, n):
+            k = order[o]
+            rx, ry = m[k, 0] - mx, m[k, 1] - my
+            px, py = tx + c * rx - sn * ry, ty + sn * rx + c * ry
+            gx, gy = int((px - origin[0]) / cell), int((py - origin[1]) / cell)
+            t = -1
+            if px > origin[0] and py > origin[1] and gx < nearest.shape[0] and gy < nearest.shape[1]:
+                t = nearest[gx, gy]
+            cost = -other[k]
+            hit = False
+            if t >= 0 and t != u0 and t != u1:
+                vx, vy = xy[t, 0] - px, xy[t, 1] - py
+                own = var[k] + base + tvar[t]
+                V = own + 1.0 / W + (rx * rx + ry * ry) / inertia
+                d2 = vx * vx + vy * vy
+                # ln of (own / (own - tvar)) to first order
+                matched = 3.0 * np.log(1.0 + d2 / (4.0 * V)) + volume[k] + tvar[t] / own
+                matched += diameter_kernel(dia[k], dia_var[k], tdia[t], dmean, dsd)
+                if matched < cost:
+                    cost = matched
+                    hit = d2 < 16.0 * V
+            loss += cost - floor[k]
+            if loss > best + bound:
+                break
+            if hit:
+                w = 1.0 / own
+                f = W * w / (W + w)
+                qx, qy = xy[t, 0] - tx, xy[t, 1] - ty
+                dot += f * (rx * qx + ry * qy)
+                cross += f * (rx * qy - ry * qx)
+                inertia += f * (rx * rx + ry * ry)
+                W += w
+                mx += rx * w / W
+                my += ry * w / W
+                tx += qx * w / W
+                ty += qy * w / W
+                h = np.sqrt(dot * dot + cross * cross)
+                c, sn = dot / h, cross / h
+        if loss > best + bound:
+            continue
+        if loss < best:
+            best = loss
+        if count == len(out):
+            keep = 0
+            for q in range(count):
+                if losses[q] < best + bound:
+                    out[keep] = out[q]
+                    losses[keep] = losses[q]
+                    keep += 1
+            count = keep
+            if 2 * keep > len(out):
+                more = np.empty((2 * len(out), 3))
+                more[:count] = out[:count]
+                more_losses = np.empty(2 * len(out))
+                more_losses[:count] = losses[:count]
+                out, losses = more, more_losses
+        out[count, 0] = tx - c * mx + sn * my
+        out[count, 1] = ty - sn * mx - c * my
+        out[count, 2] = np.arctan2(sn, c)
+        losses[count] = loss
+        count += 1
+    return out[:count].copy(), losses[:count].copy(), best
+
+
+@njit(cache=True)
+def diameter_kernel(d, v, D, mean, sd):
+    """Negative log ratio of a diameter under the tree's own and under the population's; bounded, for trees grow."""
+    if not (d == d and D == D) or sd <= 0.0:
+        return 0.0
+    pop = sd * sd + v
+    # The tree's own diameter is known to within v as well.
+    ratio = 0.5 * (d - D) ** 2 / v - 0.5 * (d - mean) ** 2 / pop - 0.5 * np.log(pop / v)
+    return min(ratio, 3.0)
+
+
+@njit(cache=True)
+def distinct_kernel(pose, loss, centre, most):
+    """Rows of the best `most` placements that differ, and the weight of the others relative to the last kept."""
+    kept = np.empty(most, np.int64)
+    at = np.empty((most, 3))
+    n = 0
+    rest = 0.0
+    for i in range(len(pose)):
+        c, s = np.cos(pose[i, 2]), np.sin(pose[i, 2])
+        x, y = pose[i, 0] + c * centre[0] - s * centre[1], pose[i, 1] + s * centre[0] + c * centre[1]
+        same = False
+        for k in range(n):
+            if abs(x - at[k, 0]) < 0.5 and abs(y - at[k, 1]) < 0.5:
+                turn = abs((pose[i, 2] - at[k, 2] + np.pi) % (2 * np.pi) - np.pi)
+                if turn < 0.1:
+                    same = True
+                    break
+        if same:
+            continue
+        if n < most:
+            kept[n] = i
+            at[n, 0], at[n, 1], at[n, 2] = x, y, pose[i, 2]
+            n += 1
+        else:
+            rest += np.exp(loss[kept[n - 1]] - loss[i])
+    return kept[:n].copy(), rest
+
+
+@njit(cache=True)
+def within_kernel(at, reach, xy, origin, bucket, buckets, start, member):
+    out = np.empty(64, np.int64)
+    n = 0
+    x0, x1 = (
+        int(max(0.0, (at[0] - reach - origin[0]) / bucket)),
+        int(min(buckets[0] - 1.0, (at[0] + reach - origin[0]) / bucket)),
+    )
+    y0, y1 = (
+        int(max(0.0, (at[1] - reach - origin[1]) / bucket)),
+        int(min(buckets[1] - 1.0, (at[1] + reach - origin[1]) / bucket)),
+    )
+    for bx in range(x0, x1 + 1):
+        for by in range(y0, y1 + 1):
+            cell = bx * buckets[1] + by
+            for q in range(start[cell], start[cell + 1]):
+                t = member[q]
+                if (xy[t, 0] - at[0]) ** 2 + (xy[t, 1] - at[1]) ** 2 <= reach * reach:
+                    if n == len(out):
+                        more = np.empty(2 * n, np.int64)
+                        more[:n] = out
+                        out = more
+                    out[n] = t
+                    n += 1
+    return out[:n].copy()

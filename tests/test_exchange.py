@@ -14,8 +14,8 @@ from test_cli import call
 from test_store import make
 
 from topograph import store
-from topograph.errors import UsageError
-from topograph.exchange import WRITERS, read_tum, write
+from topograph.errors import InputError, UsageError
+from topograph.exchange import WRITERS, read_localization, read_tum, write
 from topograph.topomap import KINDS
 
 MAP = make(12)
@@ -131,6 +131,37 @@ def test_ros_topics_of_the_thesis(written, suffix: str) -> None:
     assert len(edges.points) == 2 * len(MAP.edges)
     assert len(got["/path"].poses) == len(MAP.stamps_ns)
     assert got["/clusters"].width == len(cloud())
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".bag"])
+def test_a_localization_is_replayed_in_ros(tmp_path: Path, suffix: str) -> None:
+    """Two scans: three places left, then a pose; stamps to the nanosecond."""
+    (tmp_path / "localization.csv").write_text(
+        "stamp,state,x,y,z,qx,qy,qz,qw,hypotheses,risk,trees,tree_ids,apart,sigma_along,sigma_across\n"
+        "1700000000.100000007,ambiguous,,,,,,,,3,,0,,5.0,,\n"
+        "1700000000.200000001,tracking,1.5,-2.0,0.1,0,0,0.6,0.8,1,1e-5,2,1 2,,0.02,0.03\n"
+    )
+    (tmp_path / "hypotheses.csv").write_text(
+        "stamp,x,y,yaw,weight\n" + "".join(f"1700000000.100000007,{k},{2 * k},{0.1 * k},0.3\n" for k in (1, 2, 3))
+    )
+    run = read_localization(tmp_path)
+    assert run.placed.tolist() == [False, True]
+    write(MAP, tmp_path / f"out{suffix}", run)
+    with AnyReader([tmp_path / f"out{suffix}"], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        seen = [(c.topic, stamp, reader.deserialize(raw, c.msgtype)) for c, stamp, raw in reader.messages()]
+    first, second = (m for topic, _, m in seen if topic == "/robot_poses")
+    assert [(p.position.x, p.position.y) for p in first.poses] == [(1, 2), (2, 4), (3, 6)]
+    np.testing.assert_allclose([2 * np.arctan2(p.orientation.z, p.orientation.w) for p in first.poses], [0.1, 0.2, 0.3])
+    assert [(p.position.x, p.orientation.z) for p in second.poses] == [(1.5, pytest.approx(0.6))]
+    assert (first.header.stamp.nanosec, second.header.stamp.nanosec) == (100000007, 200000001)
+    (tf,) = (m for topic, _, m in seen if topic == "/tf")
+    assert (tf.transforms[0].header.frame_id, tf.transforms[0].child_frame_id) == ("map", "base_link")
+    assert tf.transforms[0].transform.translation.y == -2.0
+    assert min(stamp for topic, stamp, _ in seen if topic == "/topological_map") <= 1700000000100000007
+    with pytest.raises(UsageError, match=r"\.mcap"):
+        write(MAP, tmp_path / "a.csv", run)
+    with pytest.raises(InputError, match="no localization"):
+        read_localization(tmp_path / "nowhere")
 
 
 def test_what_a_map_cannot_fill_is_said(tmp_path: Path) -> None:

@@ -237,6 +237,29 @@ class BagWriter:
         message = self._msg("nav_msgs/msg/Path", header=self._header(log_ns, frame), poses=stamped)
         self._write(topic, "nav_msgs/msg/Path", log_ns, message)
 
+    def pose_array(self, topic: str, stamp_ns: int, frame: str, poses: Array) -> None:
+        """A PoseArray of poses (N, 4, 4)."""
+        message = self._msg(
+            "geometry_msgs/msg/PoseArray", header=self._header(stamp_ns, frame), poses=[self._pose(T) for T in poses]
+        )
+        self._write(topic, "geometry_msgs/msg/PoseArray", stamp_ns, message)
+
+    def transform(self, stamp_ns: int, frame: str, child: str, T: Array) -> None:
+        """A transform (4, 4) on `/tf`."""
+        stamped = self._msg(
+            "geometry_msgs/msg/TransformStamped",
+            header=self._header(stamp_ns, frame),
+            child_frame_id=child,
+            transform=self._msg(
+                "geometry_msgs/msg/Transform",
+                translation=self._vector(T[:3, 3]),
+                rotation=self._quaternion(to_quaternion(T)),
+            ),
+        )
+        self._write(
+            "/tf", "tf2_msgs/msg/TFMessage", stamp_ns, self._msg("tf2_msgs/msg/TFMessage", transforms=[stamped])
+        )
+
     def markers(
         self, topic: str, log_ns: int, frame: str, trunks: Sequence[tuple[Array, Array, float, tuple[float, ...]]],
         lines: Array, names: Sequence[tuple[Array, str]],

@@ -474,8 +474,11 @@ def repair(map_file: Path, output: Path) -> None:
 @main.command()
 @click.argument("map_file", type=click.Path(path_type=Path))
 @click.argument("output", type=click.Path(path_type=Path))
+@click.option(
+    "--localization", type=click.Path(path_type=Path), help="Results folder of `localize`, to replay in .mcap or .bag."
+)
 @click.option("--force", is_flag=True, help="Replace OUTPUT if it is there.")
-def export(map_file: Path, output: Path, force: bool) -> None:
+def export(map_file: Path, output: Path, localization: Path | None, force: bool) -> None:
     """Write MAP_FILE in the format that OUTPUT's suffix names.
 
     \b
@@ -487,7 +490,7 @@ def export(map_file: Path, output: Path, force: bool) -> None:
     .rrd                          the same for Rerun
     """
     from topograph import store
-    from topograph.exchange import WRITERS, write
+    from topograph.exchange import WRITERS, read_localization, write
 
     if output.resolve() == map_file.resolve():
         raise UsageError(f"{output}: is an input; nothing is written over it")
@@ -497,7 +500,8 @@ def export(map_file: Path, output: Path, force: bool) -> None:
         raise UsageError(f"{output}: is there already; --force replaces it")
     if not output.parent.is_dir():
         raise UsageError(f"{output}: there is no folder {output.parent}")
-    write(store.load(map_file, clouds=WRITERS[output.suffix][2]), output)
+    run = None if localization is None else read_localization(localization)
+    write(store.load(map_file, clouds=WRITERS[output.suffix][2]), output, run)
     click.echo(f"written: {output}")
 
 

@@ -44,7 +44,7 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
     "export": (
         "topograph export orchard.gpkg trees.geojson",
         "topograph export orchard.gpkg clouds.laz",
-        "topograph export orchard.gpkg foxglove.mcap",
+        "topograph export orchard.gpkg foxglove.mcap --localization results/latest",
     ),
     "view": (
         "topograph view orchard.gpkg orchard.html                   # one file to send to somebody",

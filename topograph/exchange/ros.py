@@ -10,7 +10,8 @@ import numpy as np
 
 from topograph.bags.writer import BagWriter
 from topograph.exchange.clouds import POINT, points
-from topograph.geometry import Array
+from topograph.exchange.localized import Localized
+from topograph.geometry import Array, planar
 from topograph.topomap import KINDS, TopoMap
 
 FRAME = "map"
@@ -19,27 +20,48 @@ SHOWN = 1.5
 """Height of a trunk as it is drawn, m."""
 
 
-def write_ros(topo: TopoMap, path: Path) -> None:
-    """`/topological_map` (MarkerArray: trunks, edges, addresses), `/path` (Path), `/clusters` (PointCloud2 of all viewpoints)."""
+def write_ros(topo: TopoMap, path: Path, localized: Localized | None = None) -> None:
+    """`/topological_map` (MarkerArray: trunks, edges, addresses), `/path` (Path), `/clusters` (PointCloud2 of all viewpoints); of a localization,
+    scan by scan, `/robot_poses` (PoseArray: the pose, or the places that are left) and `/tf` from `map` to `base_link` (thesis 5.2).
+    """
     folder = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix if path.suffix == '.bag' else ''}")
+    _remove(folder)
+    stamp = int(topo.stamps_ns[-1]) if len(topo.stamps_ns) else 1
+    if localized is not None:
+        stamp = int(localized.stamps_ns[0])  # the map is there when the replay begins
+    try:
+        with BagWriter(folder) as bag:
+            bag.markers("/topological_map", stamp, FRAME, _trunks(topo), _edges(topo), _names(topo))
+            if len(topo.stamps_ns):
+                bag.trajectory("/path", stamp, FRAME, topo.stamps_ns, topo.map_T_robot)
+            if topo.viewpoints:
+                cloud = points(topo)
+                view = np.zeros(len(cloud), POINT)
+                view[:] = cloud
+                bag.points("/clusters", stamp, stamp, FRAME, view)
+            if localized is not None:
+                _replay(bag, localized)
+        # One file is what Foxglove opens.
+        (folder if path.suffix == ".bag" else folder / f"{folder.name}.mcap").replace(path)
+    finally:
+        _remove(folder)
+
+
+def _remove(folder: Path) -> None:
     if folder.is_dir():
         shutil.rmtree(folder)
     folder.unlink(missing_ok=True)
-    stamp = int(topo.stamps_ns[-1]) if len(topo.stamps_ns) else 1
-    with BagWriter(folder) as bag:
-        bag.markers("/topological_map", stamp, FRAME, _trunks(topo), _edges(topo), _names(topo))
-        if len(topo.stamps_ns):
-            bag.trajectory("/path", stamp, FRAME, topo.stamps_ns, topo.map_T_robot)
-        if topo.viewpoints:
-            cloud = points(topo)
-            view = np.zeros(len(cloud), POINT)
-            view[:] = cloud
-            bag.points("/clusters", stamp, stamp, FRAME, view)
-    if path.suffix == ".bag":
-        folder.replace(path)
-        return
-    (folder / f"{folder.name}.mcap").replace(path)  # one file is what Foxglove opens
-    shutil.rmtree(folder)
+
+
+def _replay(bag: BagWriter, run: Localized) -> None:
+    for stamp, ok, T, places in zip(
+        run.stamps_ns.tolist(), run.placed.tolist(), run.map_T_robot, run.places, strict=True
+    ):
+        bag.pose_array(
+            "/robot_poses", stamp, FRAME, T[None] if ok else planar(places[:, 0], places[:, 1], places[:, 2])
+        )
+        if ok:
+            bag.transform(stamp, FRAME, "base_link", T)
 
 
 def _trunks(topo: TopoMap) -> list[tuple[Array, Array, float, tuple[float, ...]]]:

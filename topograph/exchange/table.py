@@ -8,6 +8,7 @@ from pathlib import Path
 from topograph.errors import UsageError
 from topograph.exchange.clouds import write_laz, write_pcd, write_ply
 from topograph.exchange.graphs import write_graphml
+from topograph.exchange.localized import Localized
 from topograph.exchange.ros import write_ros
 from topograph.exchange.rrd import write_rrd
 from topograph.exchange.tables import write_csv, write_geojson, write_kml, write_parquet
@@ -37,14 +38,21 @@ WRITERS: dict[str, tuple[Callable[[TopoMap, Path], None], str, bool]] = {
     ".rrd": (write_rrd, "trees, path and clouds for Rerun (needs topograph[rerun])", True),
 }
 """Suffix -> writer, what it writes, whether it needs the clouds."""
+REPLAYS = (".mcap", ".bag")
+"""Formats that a localization can be put into."""
 
 
-def write(topo: TopoMap, path: Path) -> None:
-    """Write the map by the suffix of `path`, whole or not at all.
+def write(topo: TopoMap, path: Path, localized: Localized | None = None) -> None:
+    """Write the map by the suffix of `path`, whole or not at all; with a localization to replay where the format has time (`REPLAYS`).
 
     Raises:
         UsageError: another suffix, a format that the map cannot fill, or an extra that is not installed.
     """
     if path.suffix not in WRITERS:
         raise UsageError(f"{path}: end the name in one of {', '.join(WRITERS)}")
+    if localized is not None:
+        if path.suffix not in REPLAYS:
+            raise UsageError(f"{path}: a localization is replayed in {' or '.join(REPLAYS)}")
+        write_ros(topo, path, localized)
+        return
     WRITERS[path.suffix][0](topo, path)

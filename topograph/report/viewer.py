@@ -6,7 +6,6 @@ The page's script is made of tools/viewer (deck.gl) and shipped as an asset.
 from __future__ import annotations
 
 import base64
-import csv
 import json
 from collections.abc import Sequence
 from importlib.resources import files
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from topograph.errors import InputError
+from topograph.exchange import read_localization
 from topograph.geometry import Array
 from topograph.localize import row_direction
 from topograph.report.templates import render
@@ -137,44 +136,26 @@ def localization_data(
     Raises:
         InputError: the folder holds none.
     """
-    try:
-        with (folder / "localization.csv").open(newline="") as f:
-            rows = list(csv.DictReader(f))
-        number = {int(t): k for k, t in enumerate(topo.ids)}
-        places: dict[str, list[tuple[float, float, float]]] = {}
-        if (folder / "hypotheses.csv").exists():
-            with (folder / "hypotheses.csv").open(newline="") as f:
-                for r in csv.DictReader(f):
-                    places.setdefault(r["stamp"], []).append((float(r["x"]), float(r["y"]), float(r["weight"])))
-
-        def column(name: str) -> Array:
-            return np.array([float(r[name]) if r[name] else np.nan for r in rows])
-
-        qz, qw, qx, qy = (column(k) for k in ("qz", "qw", "qx", "qy"))
-        seen = [[number[int(t)] for t in r["tree_ids"].split() if int(t) in number] for r in rows]
-        stamps = [int(s) + float(f"0.{f}") for s, _, f in (r["stamp"].partition(".") for r in rows)]
-        state = np.array([STATES.index(r["state"]) for r in rows], "u1")
-    except (OSError, KeyError, ValueError) as err:
-        raise InputError(
-            f"{folder}: no localization in it ({err}); give the results folder of `topograph localize`"
-        ) from err
-    if not rows:
-        raise InputError(f"{folder}: the localization has no scans")
-    hyps = [places.get(r["stamp"], []) for r in rows]
-    flat = np.array([h for hs in hyps for h in hs]).reshape(-1, 3)
+    found = read_localization(folder)
+    number = {int(t): k for k, t in enumerate(topo.ids)}
+    seen = [[number[t] for t in trees.tolist() if t in number] for trees in found.trees]
+    start = int(found.stamps_ns[0])
+    x, y = found.map_T_robot[:, 0, 3], found.map_T_robot[:, 1, 3]
+    yaw = np.arctan2(found.map_T_robot[:, 1, 0], found.map_T_robot[:, 0, 0])
+    hyps = found.places
+    flat = np.concatenate(hyps)
     return {
-        "time": [round(s - stamps[0], 3) for s in stamps],
+        "time": [round(1e-9 * (s - start), 3) for s in found.stamps_ns.tolist()],
         "states": list(STATES),
-        "state": _packed(state, "u1"),
-        "x": _f4(column("x")), "y": _f4(column("y")),
-        "yaw": _f4(np.arctan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy**2 + qz**2))),
-        "sigmaA": _f4(np.nan_to_num(column("sigma_along"))), "sigmaB": _f4(np.nan_to_num(column("sigma_across"))),
+        "state": _packed(np.array([STATES.index(w) for w in found.state], "u1"), "u1"),
+        "x": _f4(x), "y": _f4(y), "yaw": _f4(yaw),
+        "sigmaA": _f4(np.nan_to_num(found.along)), "sigmaB": _f4(np.nan_to_num(found.across)),
         "rowAngle": float(np.arctan2(*row_direction(topo)[::-1])),
-        "count": [int(r["hypotheses"]) for r in rows],
+        "count": found.count.tolist(),
         "seenStart": np.concatenate([[0], np.cumsum([len(s) for s in seen])]).tolist(),
         "seen": [t for s in seen for t in s],
         "hypStart": np.concatenate([[0], np.cumsum([len(h) for h in hyps])]).tolist(),
-        "hypX": _f4(flat[:, 0]), "hypY": _f4(flat[:, 1]), "hypW": _f4(flat[:, 2]),
+        "hypX": _f4(flat[:, 0]), "hypY": _f4(flat[:, 1]), "hypW": _f4(flat[:, 3]),
         "truth": None if truth_xy is None else _f4(truth_xy.ravel()),
         "error": None if errors is None else _f4(errors),
     }  # fmt: skip

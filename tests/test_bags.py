@@ -282,7 +282,7 @@ def test_no_file_and_no_recording(tmp_path: Path) -> None:
 
 def test_a_writer_that_fails_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="could not convert"), BagWriter(tmp_path / "a.bag") as w:
-        w.imu("/imu", T0, T0, "imu", ["no number", 0.0, 0.0], np.ones(3))
+        w.imu("/imu", T0, T0, "imu", np.array(["no number", "0", "0"]), np.ones(3))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -52,6 +52,9 @@ def test_csv_and_geojson_say_the_same(tmp_path: Path) -> None:
     ]
     (tmp_path / "a.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
     a, b = read_truth([tmp_path / "a.csv"]), read_truth([tmp_path / "a.geojson"])
+    assert a is not None
+    assert a.datum is not None
+    assert b is not None
     assert a.sigma == 0.3
     assert np.isnan(b.sigma)  # nobody states it
     np.testing.assert_allclose(a.trees, b.trees, atol=1e-6)
@@ -128,7 +131,7 @@ def test_ate_and_rpe_are_evos(tmp_path: Path, aligned: bool) -> None:
     poses = np.array(
         [exp(np.array([0.01, -0.02, 0.3, 4.0, -2.0, 1.0])) @ T @ exp(rng.normal(0, 0.02, 6)) for T in true]
     )
-    ns = 10**18 + np.arange(201, dtype=np.int64) * 100_000_000
+    ns: np.ndarray = 10**18 + np.arange(201, dtype=np.int64) * 100_000_000
     truth = Truth.of_path(ns, np.array(true))
     write_tum(tmp_path / "true.tum", ns, np.array(true))
     write_tum(tmp_path / "found.tum", ns, poses)

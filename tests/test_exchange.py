@@ -3,6 +3,7 @@
 import csv
 import json
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -118,7 +119,7 @@ def test_rerun(written) -> None:
 @pytest.mark.parametrize("suffix", [".mcap", ".bag"])
 def test_ros_topics_of_the_thesis(written, suffix: str) -> None:
     with AnyReader([written(suffix)], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-        got = {c.topic: reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages()}
+        got: dict[str, Any] = {c.topic: reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages()}
     markers = got["/topological_map"].markers
     trunks = [m for m in markers if m.ns == "trees"]
     assert len(trunks) == len(MAP)
@@ -148,7 +149,9 @@ def test_a_localization_is_replayed_in_ros(tmp_path: Path, suffix: str) -> None:
     assert run.placed.tolist() == [False, True]
     write(MAP, tmp_path / f"out{suffix}", run)
     with AnyReader([tmp_path / f"out{suffix}"], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-        seen = [(c.topic, stamp, reader.deserialize(raw, c.msgtype)) for c, stamp, raw in reader.messages()]
+        seen: list[tuple[str, int, Any]] = [
+            (c.topic, stamp, reader.deserialize(raw, c.msgtype)) for c, stamp, raw in reader.messages()
+        ]
     first, second = (m for topic, _, m in seen if topic == "/robot_poses")
     assert [(p.position.x, p.position.y) for p in first.poses] == [(1, 2), (2, 4), (3, 6)]
     np.testing.assert_allclose([2 * np.arctan2(p.orientation.z, p.orientation.w) for p in first.poses], [0.1, 0.2, 0.3])

@@ -9,6 +9,7 @@ import pytest
 
 import topograph
 from topograph.evaluate import Truth, map_metrics
+from topograph.localize import Fix
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
@@ -46,7 +47,7 @@ def test_the_example_of_a_detector_of_ones_own(tmp_path: Path, detections_run: t
     topo = topograph.load_map(tmp_path / "m.gpkg")
     off = []
     with Recording([path]) as r:
-        node = Node(str(tmp_path / "m.gpkg"), r.frames.find("imu_link")[:3, :3])
+        node = Node(str(tmp_path / "m.gpkg"), r.frames.get("imu_link")[:3, :3])
         for _, m in r.messages():
             if isinstance(m, Odometry):
                 node.odometry(m.stamp_ns, m.odom_T_child, m.twist)
@@ -74,7 +75,9 @@ def test_the_example_of_a_ros_node_says_what_localize_says(tmp_path: Path, lidar
     topograph.save_map(topograph.map_bags(path), tmp_path / "m.gpkg")
     with Recording([path]) as r:
         mounts = {f: r.frames.find(f) for f in ("velodyne", "imu_link", "base_link")}
-    found, said, cloud = {}, [], None
+    found: dict[int, tuple[Fix, np.ndarray]] = {}
+    said: list[str] = []
+    cloud = None
     bridge = Bridge(
         str(tmp_path / "m.gpkg"),
         mounts.get,
@@ -127,7 +130,7 @@ def test_the_examples_of_tables_and_of_an_exporter(
     assert capsys.readouterr().out.count("risk") >= 3
     surveyed = topomap_of(geopandas.read_file(tmp_path / "survey.geojson"))
     apart = [np.linalg.norm(p[:, None, :2] - p[None, :, :2], axis=2) for p in (surveyed.p, truth.trees)]
-    np.testing.assert_allclose(*apart, atol=0.01)  # lengths are metres, not those of a map projection
+    np.testing.assert_allclose(apart[0], apart[1], atol=0.01)  # lengths are metres, not those of a map projection
     with pytest.raises(topograph.errors.InputError, match="centroids"):
         topomap_of(frame.to_crs(3857).set_geometry(frame.to_crs(3857).buffer(1.0)))
     orchard = topograph.map_bags(path)

@@ -68,7 +68,7 @@ def test_native_trunk_agrees_with_cartesian_twin(
     z = body + error
     native = factors.trunk(X, L, z, cov, NONE).error(values(T, tree))
     twin = 0.5 * error @ np.linalg.inv(cov) @ error
-    assert native == pytest.approx(twin, rel=6 * np.linalg.norm(error) / np.linalg.norm(body) + 1e-6, abs=1e-9)
+    assert native == pytest.approx(twin, rel=float(6 * np.linalg.norm(error) / np.linalg.norm(body) + 1e-6), abs=1e-9)
 
 
 @given(tangents, points, arrays(float, 3, elements=st.floats(-1, 1)))

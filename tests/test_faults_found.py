@@ -23,11 +23,12 @@ def wheels_times(factor: float, begin: float, end: float):
     """Wheels that tell `factor` times the way between two times, s."""
 
     def change(bag) -> None:
-        pose, last = None, None
+        pose: np.ndarray | None = None
+        last: np.ndarray | None = None
         for e in sorted(bag.of("odometry"), key=lambda e: e.it.stamp_ns):
             q = e.it.odom_T_child
             now = from_quaternion(q[:3], q[3:])
-            if last is None:
+            if last is None or pose is None:
                 pose = now
             else:
                 step = inverse(last) @ now

@@ -6,6 +6,7 @@ from dataclasses import fields, replace
 from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -93,7 +94,8 @@ def test_coordinates_keep_their_origin_while_fixes_come_slowly(folder: Path) -> 
     with Recording([folder / "run1.bag"], config.bags) as recording:
         mapper = Mapper(mapping_config(config), recording.frames.find, recording.frames.of, start_ns=recording.start_ns)
         live = Live(mapper, config, Reckoner(None, recording.frames.get("imu_link")[:3, :3]))
-        heard, n = [], 0
+        heard: list[Any] = []
+        n = 0
         for m in stream(recording, config):
             if isinstance(m, Trunks):
                 states.append(live.process(m, heard))
@@ -127,7 +129,7 @@ def test_gnss_that_comes_late_moves_the_map_into_its_frame(folder: Path, batch: 
         frames = recording.frames
         mapper = Mapper(mapping_config(config), frames.find, frames.of)
         live = Live(mapper, config, Reckoner(None, frames.get("imu_link")[:3, :3]))
-        heard = []
+        heard: list[Any] = []
         for m in stream(recording, config):
             if isinstance(m, Trunks):
                 states.append(live.process(m, heard))

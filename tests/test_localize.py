@@ -62,7 +62,7 @@ def test_the_filter_is_the_kalman_filter_of_its_model(seed: int) -> None:
     f = Filter(2)
     x, P = np.zeros(3), np.zeros((3, 3))
 
-    def jacobian(g, at):  # type: ignore[no-untyped-def]  # a local helper
+    def jacobian(g, at):
         d = 1e-6
         return np.stack([(g(at + d * e) - g(at - d * e)) / (2 * d) for e in np.eye(len(at))], axis=1)
 
@@ -129,7 +129,7 @@ def test_landmarks_that_go_are_marginalised() -> None:
 # -- search and evidence ------------------------------------------------------------------------------------------
 
 
-def hunted(trees: Array, seen: Array, config: LocalizeConfig):  # type: ignore[no-untyped-def]  # a local helper
+def hunted(trees: Array, seen: Array, config: LocalizeConfig):
     index = index_of(trees, config)
     submap = Submap(config, Visibility(config))
     for _ in range(3):
@@ -161,7 +161,7 @@ def test_the_place_is_found_and_follows_the_map(seed: int, yaw: float, x: float,
     assert abs(turn) < 0.005
 
 
-def feed(engine: Engine, s, c: StartsConfig):  # type: ignore[no-untyped-def]  # a local helper
+def feed(engine: Engine, s, c: StartsConfig):
     d = max(s.distance, 1e-9)
     cov = np.diag([(0.03 * d) ** 2 + 1e-6, (c.white * d) ** 2 + 1e-6, c.wander**2 * d + 1e-8])
     return engine.step(Move(s.motion, cov, s.distance), sweep(s.p, c.sigma))

@@ -21,7 +21,7 @@ def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("build")
     pytest.importorskip("hatchling")
     folder = tmp_path_factory.mktemp("wheel")
-    words = [sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT]
+    words = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(ROOT)]
     subprocess.run(words, check=True, capture_output=True)
     (wheel,) = folder.glob("*.whl")
     assert wheel.stat().st_size < 3e6

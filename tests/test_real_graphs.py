@@ -75,7 +75,11 @@ def _trilaterate(p: np.ndarray, r: np.ndarray) -> np.ndarray:
 
     centre = p.mean(0)
     starts = [centre + 40 * np.array([np.cos(a), np.sin(a)]) for a in np.linspace(0, 2 * np.pi, 8, endpoint=False)]
-    fits = [least_squares(lambda q: np.linalg.norm(p - q, axis=1) - r, s, loss="soft_l1") for s in starts]
+
+    def off(q: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(p - q, axis=1) - r
+
+    fits = [least_squares(off, s, loss="soft_l1") for s in starts]
     return min(fits, key=lambda f: f.cost).x
 
 

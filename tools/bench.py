@@ -15,7 +15,7 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -65,11 +65,14 @@ def reading(bag: Path) -> dict[str, float]:
             for c, _, raw in reader.messages(connections=connections):
                 reader.deserialize(raw, c.msgtype)
 
-        all_of(detector(m, twist) for _, m in r.messages(["points"]))  # warm
+        def scans() -> Iterator[Scan]:
+            return (m for _, m in r.messages(["points"]) if isinstance(m, Scan))
+
+        all_of(detector(m, twist) for m in scans())  # warm
         return {
             "floor": best(floor) / n,
             "decode": best(lambda: all_of(r.messages(["points"]))) / n,
-            "all": best(lambda: all_of(detector(m, twist) for _, m in r.messages(["points"]))) / n,
+            "all": best(lambda: all_of(detector(m, twist) for m in scans())) / n,
         }
 
 
@@ -96,7 +99,9 @@ def rivals(bag: Path) -> dict[str, float]:
             for s in scans:
                 ok = np.isfinite(s.xyz).all(axis=1)
                 offset = s.offset[ok] if s.offset is not None else np.zeros(int(ok.sum()))
-                odometry.register_frame(s.xyz[ok].astype(float), (offset - offset.min()) / max(np.ptp(offset), 1e-6))
+                odometry.register_frame(
+                    s.xyz[ok].astype(float), (offset - offset.min()) / max(float(np.ptp(offset)), 1e-6)
+                )
 
         jobs["KISS-ICP"] = kiss
     except ImportError:

@@ -95,18 +95,18 @@ def slope(pairs: np.ndarray) -> float:
 
 def main() -> None:
     """One block a design."""
-    a = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    a.add_argument("designs", nargs="*", default=[])
-    a.add_argument("--seeds", type=int, default=5)
-    a.add_argument("--first", type=int, default=3001)
-    a.add_argument("--seconds", type=float, default=60.0)
-    a.add_argument(
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("designs", nargs="*", default=[])
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--first", type=int, default=3001)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument(
         "--keep",
         type=Path,
         help="folder in which the bags stay for another time (about 120 MB each); empty it when the simulator changes",
     )
-    a.add_argument("-v", "--verbose", action="store_true")
-    a = a.parse_args()
+    parser.add_argument("-v", "--verbose", action="store_true")
+    a = parser.parse_args()
     designs = a.designs or list(DESIGNS)
     jobs = [(d, a.first + k) for d in designs for k in range(a.seeds)]
     print(

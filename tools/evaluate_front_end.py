@@ -14,6 +14,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from recordings import map_at
@@ -43,7 +44,7 @@ class Result:
     centred: np.ndarray
 
 
-def run(bag: Path, every: int, front_end: str, shuffle: bool, no_time: bool) -> Result:
+def run(bag: Path, every: int, front_end: Literal["organised", "thesis"], shuffle: bool, no_time: bool) -> Result:
     """Detect in every n-th sweep of a bag and compare."""
     truth = Truth.load(bag.with_name(bag.stem + ".truth"))
     rng = np.random.default_rng(0)

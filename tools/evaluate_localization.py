@@ -15,6 +15,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,7 @@ from topograph.topomap import TopoMap
 WRONG_M, WRONG_RAD = 0.5, 0.1
 
 
-def told(c: StartsConfig, **changes: float) -> LocalizeConfig:
+def told(c: StartsConfig, **changes: Any) -> LocalizeConfig:
     """What the localizer is told of a scenario: its noise, as a user would from the sensors' figures."""
     return replace(
         LocalizeConfig(
@@ -339,7 +340,8 @@ def tracked(
 
 def track(seed: int, quick: float) -> None:
     """Tracking: errors, false alarms, consistency."""
-    for name, changed in (("A", {}), ("B", {}), ("D", {}), ("F", {}), ("E", {}), ("A", {"felled": 0.1, "new": 0.08})):
+    changes: list[tuple[str, dict[str, Any]]] = [(k, {}) for k in "ABDFE"]
+    for name, changed in [*changes, ("A", {"felled": 0.1, "new": 0.08})]:
         c = replace(SCENARIOS[name], trees=1000, **changed)
         out = many(partial(tracked, c=c, length=500.0), range(seed, seed + max(2, int(8 * quick))))
         e, h = np.concatenate([o[2] for o in out]), np.concatenate([o[3] for o in out])
@@ -361,7 +363,9 @@ def latency(seed: int, quick: float) -> None:
             rng = np.random.default_rng([seed, 11])
             w = world(c, rng)
             engine = Engine(index_of(w, c, config), config)
-            ms, searching, lost = [], [], 0
+            ms: list[float] = []
+            searching: list[float] = []
+            lost = 0
             for s in drive(w, c, rng, max(20.0, 150.0 * quick)):
                 began = time.thread_time()
                 tracked_before = engine.track is not None

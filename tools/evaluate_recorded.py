@@ -17,6 +17,7 @@ from topograph.evaluate.metrics import match
 from topograph.geometry import from_xyz_rpy
 from topograph.trunks import ThesisTrunksConfig, TrunksConfig
 from topograph.trunks.detector import Detector
+from topograph.trunks.frontend import Detect
 from topograph.trunks.thesis import ThesisDetector
 
 MOUNTS = {
@@ -44,7 +45,9 @@ def stems(seed: int, n: int, thesis: bool, held: bool) -> None:
                     continue
                 T = from_xyz_rpy(*pose)
                 looks = plot.looks(n, seed, elevation, T)
-                rivals = {"ours": Detector(T, TrunksConfig(score=str(held_out(name)) if held else ""))}
+                rivals: dict[str, Detect] = {
+                    "ours": Detector(T, TrunksConfig(score=str(held_out(name)) if held else ""))
+                }
                 if thesis and mount == "level":
                     rivals["thesis"] = ThesisDetector(T, ThesisTrunksConfig())
                 for who, detect in rivals.items():
@@ -77,15 +80,15 @@ def show_map(plot: rec.Plot, looks, trunks) -> None:
 
 def main() -> None:
     """Words of the command line."""
-    a = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    a.add_argument("what", choices=["stems"])
-    a.add_argument("--seed", type=int, default=2001, help="of the poses; below 1000 were looked at while building")
-    a.add_argument("--poses", type=int, default=20)
-    a.add_argument("--thesis", action="store_true")
-    a.add_argument(
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["stems"])
+    parser.add_argument("--seed", type=int, default=2001, help="of the poses; below 1000 were looked at while building")
+    parser.add_argument("--poses", type=int, default=20)
+    parser.add_argument("--thesis", action="store_true")
+    parser.add_argument(
         "--shipped", action="store_true", help="the shipped score, which other sweeps of these plots trained"
     )
-    a = a.parse_args()
+    a = parser.parse_args()
     stems(a.seed, a.poses, a.thesis, not a.shipped)
 
 

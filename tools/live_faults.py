@@ -100,7 +100,7 @@ def _own() -> None:
             if kind != "trunks" or end < 1e9:
                 LIVE[f"no {kind} from {begin:g} to {end:g} s"] = each(
                     kind, lambda m, t: None, lambda t, a=begin, b=end: a <= t < b
-                )  # type: ignore[misc]  # bound now
+                )
 
     def swapped(bag: Bag, rng: np.random.Generator) -> None:
         scans = bag.of("trunks")

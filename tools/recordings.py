@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from topograph.bags import Scan, Trunks
@@ -51,7 +52,7 @@ class Look:
 
     scan: Scan
     plot_T_base: Array
-    visible: Array
+    visible: NDArray[np.bool_]
 
 
 class Plot:
@@ -133,7 +134,7 @@ class Plot:
             out.append(Look(scan, plot_T_base, self._shown(transform(T, xyz.astype(float)))))
         return out
 
-    def _shown(self, seen: Array) -> Array:
+    def _shown(self, seen: Array) -> NDArray[np.bool_]:
         count = []
         for x, y, d in self.stems:
             g = self.ground(np.array([x, y]))
@@ -202,7 +203,7 @@ class Mapped:
     p: Array
     height: Array
     foot: Array
-    kind: Array
+    kind: NDArray[np.int64]
     diameter: Array
     sigma: Array
 

@@ -6,6 +6,7 @@ Training uses seeds below 100,000, validation from 100,000 on, reports from 200,
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from topograph.simulate.orchard import Orchard, plant
 from topograph.simulate.sensors import mounting
 
 HDL64 = tuple(np.radians(np.r_[np.linspace(2.0, -8.33, 32), np.linspace(-8.83, -24.33, 32)]))
-SENSORS = {
+SENSORS: dict[str, dict[str, Any]] = {
     "VLP-16": {"rings": 16, "fov": (-0.2618, 0.2618), "columns": 1808, "range_sigma": 0.03},
     "OS1-16": {"rings": 16, "fov": (-0.3927, 0.3927), "columns": 1024, "range_sigma": 0.02},
     "XT32": {"rings": 32, "fov": (-0.2793, 0.2618), "columns": 2000, "range_sigma": 0.01},
@@ -167,7 +168,7 @@ def _look(scene: Orchard, sensor: SensorConfig, seed: int, rng: np.random.Genera
     c, s = np.cos(yaw), np.sin(yaw)
     z = {d: float(g.at(xy + np.array(d))) for d in [(0.3 * c, 0.3 * s), (-0.3 * c, -0.3 * s), (-0.3 * s, 0.3 * c), (0.3 * s, -0.3 * c)]}  # fmt: skip
     front, back, left, right = z.values()
-    world_T_base = from_xyz_rpy(*xy, np.mean([front, back, left, right]), np.arctan2(left - right, 0.6), -np.arctan2(front - back, 0.6), yaw)  # fmt: skip
+    world_T_base = from_xyz_rpy(xy[0], xy[1], float(np.mean([front, back, left, right])), np.arctan2(left - right, 0.6), -np.arctan2(front - back, 0.6), yaw)  # fmt: skip
     base_T_lidar = mounting(sensor)
     moving = rng.random() < 0.7
     twist = np.array([rng.uniform(0, 1.5), 0, 0, 0, 0, rng.normal(0, 0.2)]) * moving

@@ -166,15 +166,15 @@ RECORDED_FROM = 10_000_000
 
 def main() -> None:
     """Collect, train, calibrate, validate, write."""
-    a = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    a.add_argument("--scenes", type=int, default=1200)
-    a.add_argument("--looks", type=int, default=6)
-    a.add_argument("--cache", type=Path, help="keep what was collected here")
-    a.add_argument(
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=int, default=1200)
+    parser.add_argument("--looks", type=int, default=6)
+    parser.add_argument("--cache", type=Path, help="keep what was collected here")
+    parser.add_argument(
         "--recorded", nargs="*", default=[], choices=["pine_plot", "lpine1", "street"], help="recordings to train on"
     )
-    a.add_argument("--out", type=Path, default=SHIPPED)
-    a = a.parse_args()
+    parser.add_argument("--out", type=Path, default=SHIPPED)
+    a = parser.parse_args()
     if a.cache and a.cache.exists():
         with np.load(a.cache) as f:
             X, y, e, sweep, Xv, yv, ev, sweep_v = (f[k] for k in ("X", "y", "e", "sweep", "Xv", "yv", "ev", "sweep_v"))
@@ -192,7 +192,7 @@ def main() -> None:
     Zr, yr, wr, sweep_r = recorded(a.recorded, share)
     Z, every = np.concatenate([X, Zr]), np.concatenate([sweep, sweep_r])
     names, rows = np.unique(every, return_inverse=True)
-    Z[np.ix_((rng.random(len(names)) < DROPPED)[rows], overhead)] = 0.0
+    Z[np.ix_((rng.random(len(names)) < DROPPED)[rows], np.array(overhead))] = 0.0
     mean, deviation = Z[: len(X)].mean(0, dtype=float), Z[: len(X)].std(0, dtype=float) + 1e-6
     layers = network.train(normalised(Z, mean, deviation), np.r_[y, yr], np.r_[weight, wr], every)
     Xs, y_all = X, y

@@ -26,7 +26,7 @@ ONLY_POINTS = BagsConfig(topic_imu="none", topic_odometry="none", topic_fix="non
 def some_scans(bag: Path) -> tuple[Truth, np.ndarray, list[Scan]]:
     """Truth, mounting and a few scans of a bag."""
     with Recording([bag], ONLY_POINTS) as r:
-        scans = [m for n, (_, m) in enumerate(r.messages(["points"])) if n % 60 == 30]
+        scans = [m for n, (_, m) in enumerate(r.messages(["points"])) if n % 60 == 30 and isinstance(m, Scan)]
         return Truth.load(bag.with_name(bag.stem + ".truth")), r.frames.get("velodyne"), scans[:SCANS]
 
 

@@ -94,6 +94,7 @@ def test_the_path_is_right(rtk: list[Mapped]) -> None:
         e = m.solved.estimate
         true = interpolate(m.truth.stamps_ns, m.truth.world_T_robot, e.stamps_ns)[:, :3, 3]
         assert m.topo.datum is not None
+        assert m.truth.datum is not None
         off = e.map_T_robot[:, :3, 3] - m.topo.datum.to_enu(m.truth.datum.to_geodetic(true))
         assert np.linalg.norm(off[:, :2], axis=1).max() < 0.05
 

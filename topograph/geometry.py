@@ -155,6 +155,11 @@ def fit_rigid_2d(source: Array, target: Array, weight: Array | None = None) -> t
     """(x, y, yaw) of the rigid motion that takes `source` (N, 2) onto `target` (N, 2), least squares.
 
     Horn's closed form in the plane; `weight` (N,) defaults to ones.
+
+    >>> corner = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 3.0]])
+    >>> turned = corner @ np.array([[0.0, 1.0], [-1.0, 0.0]]) + [1.0, 2.0]      # by 90° to the left, then moved
+    >>> tuple(round(v, 3) for v in fit_rigid_2d(corner, turned))
+    (1.0, 2.0, 1.571)
     """
     w = np.ones(len(source)) if weight is None else weight
     w = w / w.sum()
@@ -180,7 +185,14 @@ def align_se3(source: Array, target: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Datum:
-    """Origin of the `map` frame on the ellipsoid: latitude and longitude in degrees, height in metres (WGS84)."""
+    """Origin of the `map` frame on the ellipsoid: latitude and longitude in degrees, height in metres (WGS84).
+
+    >>> datum = Datum(44.9, 8.2, 180.0)
+    >>> datum.to_enu([44.9001, 8.2, 180.0]).round(2).tolist()      # a ten thousandth of a degree to the north
+    [0.0, 11.11, -0.0]
+    >>> datum.to_geodetic([0.0, 11.11, 0.0]).round(4).tolist()
+    [44.9001, 8.2, 180.0]
+    """
 
     lat: float
     lon: float

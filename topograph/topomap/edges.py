@@ -39,6 +39,10 @@ def neighbours(xy: Array, config: TopomapConfig) -> NDArray[np.int64]:
     Gabriel graph: two trees are neighbours when no third stands in the circle over their distance. It is part of the
     Delaunay triangulation and needs no scale. The long edges that gaps and the outer rim leave are dropped: those
     more than three times the median edge at both their ends.
+
+    >>> bent = np.array([[0.0, 0.0], [4.0, 0.5], [8.0, 0.0]])
+    >>> neighbours(bent, TopomapConfig()).tolist()      # the first and the last have one between them
+    [[0, 1], [1, 2]]
     """
     n = len(xy)
     if n < 2:

@@ -86,7 +86,11 @@ class TopoMap:
 
     @staticmethod
     def of_points(xy: Array, sigma: float = 0.01) -> TopoMap:
-        """A local map of bare trees at `xy` (T, 2), known to `sigma` m: no path, no edges."""
+        """A local map of bare trees at `xy` (T, 2), known to `sigma` m: no path, no edges.
+
+        >>> TopoMap.of_points(np.array([[0.0, 0.0], [4.0, 0.0]]))
+        <TopoMap local: 2 trees, 0 other landmarks, 0 edges, 0 viewpoints, 0 sessions>
+        """
         n = len(xy)
         unknown = np.full(n, np.nan)
         return TopoMap(

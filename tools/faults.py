@@ -625,7 +625,8 @@ def attempt(name: str, bag: Bag, path: Path) -> Outcome:
     wrong = ghosts > 0 or bool(((error > 0.10) & (error > 3 * sigma)).any())
     est = solved.estimate
     off = 0.0
-    if topo.datum is not None and bag.truth.datum is not None:
+    if topo.datum is not None:
+        assert bag.truth.datum is not None
         true = interpolate(bag.truth.stamps_ns, bag.truth.world_T_robot, est.stamps_ns)[:, :3, 3]
         off = float(
             np.linalg.norm(

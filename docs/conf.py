@@ -16,6 +16,8 @@ myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 html_theme = "furo"
 html_title = "topograph"
+html_show_copyright = False
+smartquotes = False  # two hyphens of an option are no dash
 exclude_patterns = ["_generated"]
 autodoc_typehints = "description"
 autodoc_member_order = "bysource"
@@ -38,11 +40,14 @@ def _block(self: Any, node: nodes.math_block) -> None:
     raise nodes.SkipNode
 
 
-def _no_rst(_app: Any, _what: str, _name: str, _obj: object, _options: object, lines: list[str]) -> None:
-    """Docstrings are plain text: a bar or a star in them (|x|, 4 * x) is no markup."""
-    lines[:] = [
-        re.sub(r"(?<![`\\])([|*])(?!`)", r"\\\1", line) if not line.startswith((":", "..")) else line for line in lines
-    ]
+def _no_rst(_app: Any, what: str, _name: str, _obj: object, _options: object, lines: list[str]) -> None:
+    """Docstrings are plain text: a bar or a star in them (|x|, 4 * x) is no markup, nor is a colon in a property's a type; names that share a line
+    of Attributes stay together."""
+    for k, line in enumerate(lines):
+        if not line.startswith((":", "..")):
+            line = re.sub(r"(?<![`\\])([|*])(?!`)", r"\\\1", line)
+        line = re.sub(r"^( +)((?:\w+, )+\w+):", lambda m: f"{m[1]}{m[2].replace(', ', ' / ')}:", line)
+        lines[k] = line.replace(": ", " – ", 1) if what in ("property", "attribute") and k == 0 else line
 
 
 def setup(app: Any) -> None:

@@ -114,9 +114,7 @@ def main() -> None:
     import tf2_ros
     from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
     from nav_msgs.msg import Odometry as OdometryMessage
-    from rclpy.qos import (
-        qos_profile_sensor_data,  # best effort: reliable subscribers hear nothing of best-effort drivers
-    )
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
     from sensor_msgs.msg import Imu as ImuMessage
     from sensor_msgs.msg import PointCloud2
     from std_msgs.msg import String
@@ -134,9 +132,7 @@ def main() -> None:
 
     def lookup(frame: str) -> np.ndarray | None:
         try:
-            t = buffer.lookup_transform(
-                base, frame, rclpy.time.Time(), timeout=rclpy.duration.Duration(seconds=1.0)
-            ).transform
+            t = buffer.lookup_transform(base, frame, rclpy.time.Time(), timeout=rclpy.duration.Duration()).transform
         except tf2_ros.TransformException:
             return None
         return from_quaternion(
@@ -162,9 +158,13 @@ def main() -> None:
         broadcaster.sendTransform(t)
 
     bridge = Bridge(map_file, lookup, found, lambda line: states.publish(String(data=line)))
-    node.create_subscription(OdometryMessage, "odom", bridge.odometry, qos_profile_sensor_data)
-    node.create_subscription(ImuMessage, "imu", bridge.imu, qos_profile_sensor_data)
-    node.create_subscription(PointCloud2, "points", bridge.points, qos_profile_sensor_data)
+    # Best effort: reliable subscribers hear nothing of best-effort drivers. Deep: while a scan is worked on, wheels and IMU go on.
+    small = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+    node.create_subscription(OdometryMessage, "odom", bridge.odometry, small)
+    node.create_subscription(ImuMessage, "imu", bridge.imu, small)
+    node.create_subscription(
+        PointCloud2, "points", bridge.points, QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+    )
     rclpy.spin(node)
 
 

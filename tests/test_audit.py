@@ -135,3 +135,12 @@ def test_trees_that_stand_twice_are_counted() -> None:
     grid = np.stack(np.meshgrid(np.arange(6.0) * 4, np.arange(5.0) * 4), axis=2).reshape(-1, 2)
     assert audit.twice(grid) == 0.0
     assert audit.twice(np.concatenate([grid, grid[:8] + 0.4])) == pytest.approx(16 / 38)
+
+
+def test_trees_that_hardly_a_scan_shows_are_doubted() -> None:
+    """A LiDAR that lies on its side gave "1 trees, sound" of 300 scans."""
+    (found,) = audit.seldom(300, 29)
+    assert not found.refuses
+    assert found.value > found.bound
+    assert not list(audit.seldom(300, 200))
+    assert not list(audit.seldom(20, 1))

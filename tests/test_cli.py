@@ -139,7 +139,7 @@ def test_bad_fixes_are_counted_and_the_map_is_local(tmp_path: Path) -> None:
         (["map", "{good}", "--into", "none.gpkg"], 5, "no such map"),
         (["map", "{good}", "--extrinsic", "gnss=1,2"], 2, "FRAME=X,Y,Z"),
         (["map", "{empty}"], 3, "empty"),
-        (["map", "{good}", "--config", "none.yaml"], 2, "cannot be read"),
+        (["map", "{good}", "--config", "none.yaml"], 2, "no such file"),
         (["export", "none.gpkg", "x.csv"], 5, "no such map"),
         (["simulate", "x.bag", "--design", "jungle"], 2, "known are"),
         (["map"], 2, "Missing argument"),

@@ -2,6 +2,8 @@
 
 import csv
 import json
+import sys
+import warnings
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -16,8 +18,9 @@ from test_store import make
 
 from topograph import store
 from topograph.errors import InputError, UsageError
-from topograph.exchange import WRITERS, read_localization, read_tum, write
+from topograph.exchange import WRITERS, geodataframe, read_localization, read_tum, topomap_of, write
 from topograph.topomap import KINDS
+from topograph.trunks.score import TREE
 
 MAP = make(12)
 
@@ -203,3 +206,50 @@ def test_gdal_finds_no_fault(tmp_path: Path) -> None:
         )
         assert done.returncode == 0, done.stdout + done.stderr
         assert not done.stdout.strip(), done.stdout
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda f: f.iloc[:0], "no trees"),
+        (lambda f: f.assign(diameter=30.0), "centimetres"),
+        (lambda f: f.assign(diameter="x"), "not a number"),
+        (lambda f: f.set_geometry(f.translate(xoff=400.0)), "CRS"),
+        (lambda f: f.set_geometry([f.geometry.iloc[0], *f.translate(yoff=3.0).iloc[1:]]), "km apart"),
+    ],
+)
+def test_a_table_that_is_no_orchard_is_refused(change, says: str) -> None:
+    pytest.importorskip("geopandas")
+    frame = geodataframe(MAP)[["diameter", "geometry"]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # geopandas on degrees
+        bad = change(frame)
+    with pytest.raises(InputError, match=says):
+        topomap_of(bad)
+
+
+def test_posts_of_a_table_are_no_trees() -> None:
+    pytest.importorskip("geopandas")
+    assert len(topomap_of(geodataframe(MAP))) == int((MAP.kind == TREE).sum())
+
+
+@pytest.mark.parametrize(("suffix", "module"), [(".parquet", "pyarrow"), (".laz", "lazrs"), (".rrd", "rerun")])
+def test_an_extra_that_is_missing_is_named(
+    tmp_path: Path, suffix: str, module: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(UsageError, match=r"pip install 'topograph\["):
+        write(MAP, tmp_path / f"a{suffix}")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_link_stays_one_and_a_private_file_private(tmp_path: Path) -> None:
+    real, link = tmp_path / "real.csv", tmp_path / "link.csv"
+    real.write_text("old")
+    real.chmod(0o600)
+    link.symlink_to(real)
+    write(MAP, link)
+    assert link.is_symlink()
+    assert real.read_text().startswith("id")
+    assert real.stat().st_mode & 0o777 == 0o600
+    write(MAP, tmp_path / f"{'x' * 245}.csv")

@@ -68,8 +68,13 @@ def load(path: Path | None, overrides: dict[str, Any] | None = None) -> Config:
 def _read(path: Path) -> dict[str, Any]:
     if not path.exists() and str(path) in PRESETS:
         path = preset(str(path))
-    if path.exists() and not path.is_file():
-        raise UsageError(f"{path}: not a file")
+    if not path.is_file():
+        what = (
+            "not a file"
+            if path.exists()
+            else f"no such file; give a YAML file as `topograph config` prints it, or {' or '.join(PRESETS)}"
+        )
+        raise UsageError(f"{path}: {what}")
     try:
         data = yaml.load(path.read_text(), _Loader) or {}  # noqa: S506  # a subclass of the safe loader
     except (OSError, yaml.YAMLError, ValueError, TypeError, RecursionError) as err:

@@ -1,6 +1,18 @@
 """Do the streams agree with each other and with the solve? Sound, doubtful because, refused because."""
 
-from topograph.audit.checks import REFUSING, fixes, headings, jumps, lean, offsets, standing, trunks, twice, unclaimed
+from topograph.audit.checks import (
+    REFUSING,
+    fixes,
+    headings,
+    jumps,
+    lean,
+    offsets,
+    seldom,
+    standing,
+    trunks,
+    twice,
+    unclaimed,
+)
 from topograph.audit.verdict import Finding, Verdict
 
 __all__ = [
@@ -12,6 +24,7 @@ __all__ = [
     "jumps",
     "lean",
     "offsets",
+    "seldom",
     "standing",
     "trunks",
     "twice",

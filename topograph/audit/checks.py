@@ -297,6 +297,20 @@ def unclaimed(p: Array, score: Array, used: Array, tree: NDArray[np.int64]) -> I
         )  # fmt: skip
 
 
+def seldom(scans: int, with_trees: int) -> Iterator[Finding]:
+    """Do the scans show the trees of the map at all? `with_trees` of the `scans` that were taken on the way have a sighting of one."""
+    share = with_trees / max(scans, 1)
+    if scans >= FEW_SCANS and share < SELDOM:
+        yield Finding(
+            name="seldom", value=1.0 - share, bound=1.0 - SELDOM, unit="",
+            sentence=f"only {with_trees} of {scans} scans show a tree of the map: there are next to none, or the LiDAR is mounted otherwise than TF says",
+        )  # fmt: skip
+
+
+FEW_SCANS, SELDOM = 50, 0.25
+"""Scans, and share of them that show a tree: of a recorded street and park all but all do, with the LiDAR turned by 90° a tenth."""
+
+
 def lean(problem: Problem, estimate: Estimate) -> tuple[Array, Array]:
     """Mean lean (2,) of the trunks in the robot's frame, forward and left, rad, and its standard deviation.
 

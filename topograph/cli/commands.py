@@ -23,6 +23,7 @@ from topograph.cli.common import (
     input_options,
     main,
     peak_mb,
+    plain_span,
     progress_bar,
     results_folder,
     say_if_cold,
@@ -31,6 +32,9 @@ from topograph.cli.common import (
     versions,
 )
 from topograph.errors import InputError, MapError, UsageError
+
+WHOLE = (0.0, float("inf"))
+"""From and to, s: all of a recording."""
 
 
 @main.command("map")
@@ -83,6 +87,10 @@ def map_command(
         folder = stack.enter_context(results_folder(results))
         target = into or output or folder / "map.gpkg"
         check_target(target)
+        if results is not None and target == folder / "map.gpkg" and target.exists() and not force:
+            raise UsageError(
+                f"{target}: is there already, of an earlier run; --force replaces it, or give another --results"
+            )
         if output is not None and output.exists() and not force:
             raise UsageError(f"{output}: is there already; --force replaces it, --into {output} extends it")
         if into is not None and not into.exists():
@@ -107,7 +115,9 @@ def map_command(
             solved = pipeline.solve_run(
                 run, config, check_fixes=check_fixes, known=old, placed=placed, progress=progress
             )
-            topo, verdict = save_results(solved, config, inputs, bags, folder, target, true, old, progress, accept)
+            topo, verdict = save_results(
+                solved, config, inputs, bags, folder, target, true, old, progress, accept, (from_s, to_s)
+            )
     say_verdict(solved, topo, verdict, folder, target, run.notes)
 
 
@@ -173,7 +183,7 @@ def say_verdict(solved: Any, topo: Any, verdict: Any, folder: Path, target: Path
 
 def save_results(
     solved: Any, config: Any, hashes: Callable[[], list[dict[str, str]]], bags: Sequence[Path], folder: Path, target: Path, true: Any, old: Any,
-    progress: Callable[[str, float], None], accept: Sequence[str] = (),
+    progress: Callable[[str, float], None], accept: Sequence[str] = (), span_s: tuple[float, float] = WHOLE,
 ) -> Any:  # fmt: skip
     """Write the map (if it has trees, and the audit does not refuse it), path, configuration and reports; returns map and verdict."""
     import json
@@ -190,7 +200,12 @@ def save_results(
     verdict = pipeline.audited(solved).accepting(accept)
     inputs = hashes()
     text = dump(config)
-    meta = {"config": text, "inputs": json.dumps(inputs), "versions": json.dumps(versions()), "verdict": verdict.word}
+    no_trees = pipeline.why_no_trees(solved)
+    word = "no trees" if no_trees else verdict.word
+    meta = {
+        "config": text, "inputs": json.dumps(inputs), "versions": json.dumps(versions()), "verdict": verdict.word,
+        "why": "; ".join(verdict.reasons),
+    }  # fmt: skip
     progress("map", 0.0)
     topo = pipeline.topo_map(solved, config, meta)
     if old is not None:
@@ -213,35 +228,41 @@ def save_results(
         figures = {"Map": picture, **figures}
     if e.residuals:
         figures["Residuals by factor"] = report.residual_figure(e.residuals)
-        figures["Residuals over time"] = report.residual_time_figure(e.residuals, e.residual_ns)
+        figures["Residuals over time"] = report.residual_time_figure(e.residuals, e.residual_ns, solved.run.start_ns)
         (folder / "residuals.png").write_bytes(figures["Residuals by factor"])
     seconds = {**solved.seconds, "map and report": time.perf_counter() - began}
     write_text(folder / "config.yaml", text)
-    notes = [*solved.run.notes, *filter(None, [pipeline.why_no_trees(solved)])]
+    notes = [*solved.run.notes, *filter(None, [no_trees])]
     facts = {
         "from": ", ".join(p.name for p in bags),
         "recorded": f"{solved.run.duration_s:.0f} s",
+        **({} if span_s == WHOLE else {"of which": f"{span_s[0]:g} to {span_s[1]:g} s"}),
         "topograph": __version__,
     }
-    if solved.problem.n_trees and verdict.word != "refused":
+    if word in ("sound", "doubtful"):
         store.save(topo, target)
     report.write_json(
         folder / "report.json", metrics, solved.run.skipped, inputs, seconds, peak_mb(), notes=notes, versions=versions(),
-        topics=solved.run.chosen, announced=solved.run.announced, scales=solved.estimate.scales, verdict=verdict.record(),
+        topics=solved.run.chosen, span_s=plain_span(span_s), announced=solved.run.announced, scales=solved.estimate.scales, verdict={**verdict.record(), "word": word},
         offsets=[{"name": o.name, "value": o.value.tolist(), "sigma": o.sigma.tolist(), "gain": o.gain} for o in solved.estimate.offsets],
     )  # fmt: skip
     title = f"Map of {', '.join(p.name for p in bags)}"
     trees, others = int(topo.is_tree.sum()), int((~topo.is_tree).sum())
     count = f"{trees} trees" + (f" and {others} posts" if others else "")
+    there = [w for w, n in (("wheels", solved.streams.odometry_ns), ("IMU", solved.streams.imu_ns), ("fixes", solved.streams.fix_ns),
+                            ("headings", solved.streams.heading_ns)) if len(n)]  # fmt: skip
     sentence = {
-        "sound": f"– {count}; clocks, mountings, wheels, fixes and trunks agree.",
+        "no trees": f"– no map was saved, the path is in path.tum; {no_trees}",
+        "sound": f"– {count}; {', '.join(there)} and trunks agree." if there else f"– {count}.",
         "doubtful": f"– {count}; the map is saved, look at what the audit found:",
         "refused": "– no map was saved; the path is in path.tum. The audit found:",
-    }[verdict.word]
+    }[word]
     report.Page(
-        title=title, word=verdict.word, sentence=sentence, findings=verdict.findings, facts=facts, metrics=metrics, figures=figures,
+        title=title, word=word, sentence=sentence, findings=verdict.findings, facts=facts, metrics=metrics, figures=figures,
         notes=notes, skipped=solved.run.skipped, walk=("map.html", "Walk through the map") if len(topo) else None,
     ).write(folder / "report.html")  # fmt: skip
+    for stale in () if len(topo) else ("map.html", "map.png"):  # of an earlier run in this folder
+        (folder / stale).unlink(missing_ok=True)
     if len(topo):
         said = [f"{verdict.word}: {r}" for r in verdict.reasons]
         write_viewer(folder / "map.html", topo, title, notes=said[:1])

@@ -282,6 +282,11 @@ def versions() -> dict[str, str]:
     }
 
 
+def plain_span(span_s: tuple[float, float]) -> list[float | None]:
+    """From and to (s) as JSON has them."""
+    return [s if math.isfinite(s) else None for s in span_s]
+
+
 def peak_mb() -> float:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1024 if sys.platform != "darwin" else peak / 1024**2

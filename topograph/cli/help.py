@@ -60,7 +60,18 @@ EXAMPLES: Mapping[str, Sequence[str]] = {
 }
 """Command -> lines to type; a test parses them."""
 
-RECORDING = frozenset({"config_file", "extrinsic", "base_frame", "strict", "front_end"})
+ARGUMENTS = {
+    "BAGS": "A run: .bag, a ROS 2 folder, a lone .mcap or .db3; several files of one run.",
+    "RUNS": "A recording each; the first is mapped.",
+    "BAG... [MAP": "A run, or the .journal of one that was killed; and a map to localize in and to extend.",
+    "MAP": "A map file (.gpkg).",
+    "MAP_FILE": "A map file (.gpkg).",
+    "OUTPUT": "The file to write.",
+    "FOLDER": "Where the results go.",
+}
+"""Positional words -> what they are."""
+
+RECORDING = frozenset({"extrinsic", "base_frame", "strict", "front_end"})
 """Options that say how a recording is read, besides the topics."""
 
 
@@ -69,8 +80,13 @@ class Command(click.Command):
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Click's hook."""
-        groups: dict[str, list[tuple[str, str]]] = {"Options": [], "How the recording is read": []}
+        groups: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": [], "How the recording is read": []}
         for p in self.get_params(ctx):
+            if isinstance(p, click.Argument):
+                word = p.make_metavar(ctx).strip("[].")
+                if word in ARGUMENTS:
+                    groups["Arguments"].append((word, ARGUMENTS[word]))
+                continue
             record = p.get_help_record(ctx)
             if record is not None:
                 reads = p.name in RECORDING or str(p.name).startswith("topic_")

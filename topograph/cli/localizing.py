@@ -18,6 +18,7 @@ from topograph.cli.common import (
     input_options,
     main,
     peak_mb,
+    plain_span,
     progress_bar,
     results_folder,
     say_if_cold,
@@ -62,6 +63,8 @@ def localize(
 
     if not 0.0 <= from_s < to_s:
         raise UsageError(f"--from {from_s} --to {to_s}: nothing lies between")
+    if map_file.suffix != ".gpkg" and any(b.suffix == ".gpkg" for b in bags):
+        raise UsageError(f"{map_file}: the map comes first: topograph localize MAP.gpkg {map_file} ...")
     config = config_of(config_file, words)
     if risk is not None:
         config = replace(config, localize=replace(config.localize, risk=risk))
@@ -110,22 +113,27 @@ def localize(
         inputs = hashes()
         said = verdict(run.reports, run.distance)
         notes = [*run.notes, said]
+        if topo.meta.get("verdict", "sound") not in ("sound", "not audited", ""):
+            why = topo.meta.get("why", "")
+            notes.append(f"the map that it is localized in is {topo.meta['verdict']}" + (f": {why}" if why else ""))
         if run.exploded:
             notes.append(f"{run.exploded} scans had more combinations than thesis.combinations and measured nothing")
         write_json(
             folder / "report.json", metrics, run.skipped, inputs, run.seconds, peak_mb(), notes=notes, versions=versions(),
-            topics=run.chosen, method=method,
+            topics=run.chosen, span_s=plain_span((from_s, to_s)), method=method, verdict={"word": said.partition(" ")[0].rstrip(":"), "sentence": said},
         )  # fmt: skip
         facts = {
             "map": map_file.name,
             "method": method,
             "measure": config.localize.measure,
             "recorded": f"{run.duration_s:.0f} s",
+            **({} if (from_s, to_s) == (0.0, float("inf")) else {"of which": f"{from_s:g} to {to_s:g} s"}),
             "topograph": __version__,
         }
         word, _, rest = said.partition(" ")
+        word = word.rstrip(":")
         Page(
-            title=f"Localization of {', '.join(p.name for p in bags)}", word=word.rstrip(":"), sentence=rest, facts=facts, metrics=metrics,
+            title=f"Localization of {', '.join(p.name for p in bags)}", word=word, sentence=rest, tone=tone(run.reports), facts=facts, metrics=metrics,
             figures=figures, notes=[n for n in notes if n is not said], skipped=run.skipped,
             walk=("replay.html", "Replay it on the map"),
         ).write(folder / "report.html")  # fmt: skip
@@ -178,12 +186,40 @@ def verdict(reports: Sequence[Any], distance: Sequence[float]) -> str:
     """One line: found after how far, or unknown and why."""
     committed = [i for i, r in enumerate(reports) if r.fix is not None]
     if committed:
-        share = len(committed) / max(len(reports) - committed[0], 1)
-        return f"found after {distance[committed[0]]:.1f} m; a pose for {100 * share:.1f} % of the scans from then on"
+        after = reports[committed[0] :]
+        share, tracked = len(committed) / len(after), sum(r.state == "tracking" for r in after) / len(after)
+        widest = max(max(r.along, r.across) for r in after if r.fix is not None)
+        parts = [
+            f"found after {distance[committed[0]]:.1f} m",
+            f"a pose for {100 * share:.1f} % of the scans from then on",
+            *(
+                []
+                if share - tracked < 0.005
+                else [f"{100 * (share - tracked):.0f} % of them by wheels and gyro alone (degraded)"]
+            ),
+            *([] if not widest > WIDE_M else [f"known to {widest:.1f} m (1 σ) at worst"]),
+            *([] if reports[-1].fix is not None else [f"{reports[-1].state} at the end"]),
+        ]
+        return "; ".join(parts)
     last = reports[-1]
     if last.hypotheses > 1:
         return f"unknown: {last.hypotheses} places fit, up to {last.apart:.0f} m apart"
     return "unknown: nothing on this map fits what was seen well enough"
+
+
+WIDE_M = 0.5
+"""Deviation that is worth a word."""
+MOSTLY = 0.9
+
+
+def tone(reports: Sequence[Any]) -> str:
+    """Good where the robot was tracked by the trees nearly all of the time after it was found, and at the end."""
+    committed = [i for i, r in enumerate(reports) if r.fix is not None]
+    if not committed:
+        return "bad"
+    after = reports[committed[0] :]
+    tracked = sum(r.state == "tracking" for r in after) / len(after)
+    return "good" if tracked >= MOSTLY and reports[-1].fix is not None else "fair"
 
 
 def _csv(reports: Sequence[Any]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 import webbrowser
 from functools import lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -11,7 +12,7 @@ from typing import Any
 
 import click
 
-from topograph.cli.common import check_output, main
+from topograph.cli.common import check_output, hash_of, main
 from topograph.errors import TopographError, UsageError
 
 
@@ -47,13 +48,19 @@ def view(
         raise UsageError("--serve writes no page: leave the name out")
     if not serve:
         check_output(target, [map_file], (".html", ".htm"))
+        if not target.parent.is_dir():
+            raise UsageError(f"{target}: there is no folder {target.parent}")
         if target.exists() and not force:
             raise UsageError(f"{target}: is there already; --force replaces it")
     topo = store.load(map_file, clouds=not serve)
     notes = [] if topo.datum is not None else ["not georeferenced: the frame is the first pose of the run"]
     if topo.meta.get("verdict", "sound") not in ("sound", ""):
-        notes.append(f"the audit called this map {topo.meta['verdict']}")
+        why = topo.meta.get("why", "")
+        notes.append(f"the audit called this map {topo.meta['verdict']}" + (f": {why}" if why else ""))
     replay = None if localization is None else localization_data(localization, topo)
+    if localization is not None and not of_this_map(localization, map_file):
+        notes.append(f"{localization} was localized in another map, or in another state of this one")
+        click.echo(f"note: {notes[-1]}", err=True)
     if not serve:
         write_viewer(target, topo, map_file.name, notes=notes, localization=replay)
         click.echo(f"written: {target} ({target.stat().st_size / 1e6:.1f} MB, opens without network)")
@@ -61,7 +68,10 @@ def view(
             webbrowser.open(target.resolve().as_uri())
         return
     text = page(topo, map_file.name, notes=notes, localization=replay, served=True).encode()
-    server = ThreadingHTTPServer(("127.0.0.1", port), _handler(text, map_file, topo))
+    try:
+        server = ThreadingHTTPServer(("127.0.0.1", port), _handler(text, map_file, topo))
+    except OSError as err:
+        raise UsageError(f"--port {port}: {err.strerror}; another one, or none for any that is free") from err
     address = f"http://127.0.0.1:{server.server_address[1]}/"
     click.echo(f"{address} (Ctrl-C ends)")
     if open_it:
@@ -72,6 +82,16 @@ def view(
         click.echo("ended", err=True)
     finally:
         server.server_close()
+
+
+def of_this_map(folder: Path, map_file: Path) -> bool:
+    """The results in `folder` are of this very file; where they do not say so, they are believed."""
+    try:
+        inputs = json.loads((folder / "report.json").read_text())["inputs"]
+        known = [i["sha256"] for i in inputs if i["path"].endswith(".gpkg")]
+    except (OSError, ValueError, KeyError, TypeError):
+        return True
+    return not known or hash_of(map_file, threading.Event()) in known
 
 
 def _handler(text: bytes, map_file: Path, topo: Any) -> type[BaseHTTPRequestHandler]:

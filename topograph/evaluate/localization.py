@@ -77,6 +77,10 @@ def localization_metrics(
         out.append(Metric("share with a pose after the first", float(committed[first:].mean()), "", "higher"))
         lost = np.flatnonzero(committed[:-1] & ~committed[1:])
         out.append(Metric("times lost", len(lost), "", "lower"))
+        tracking = np.array([r.state == "tracking" for r in reports[first:]])
+        out.append(Metric("share tracked by trees after the first", float(tracking.mean()), "", "higher"))
+        widest = max((max(r.along, r.across) for r in reports if r.fix is not None), default=np.nan)
+        out.append(Metric("largest stated deviation (1 σ)", float(widest), "m", "lower"))
     if len(update_ms) > 1:
         out.append(Metric("update median", float(np.median(update_ms[1:])), "ms", "lower"))
     if errors is None or not len(errors.stamps_ns):

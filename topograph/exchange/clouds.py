@@ -61,6 +61,9 @@ def write_laz(topo: TopoMap, path: Path) -> None:
     """LAS 1.4, compressed where the name ends in .laz; point_source_id is the tree's id (modulo 2^16), coordinates are the map's, in mm."""
     try:
         import laspy
+
+        if path.suffix == ".laz":
+            import lazrs  # noqa: F401  # laspy looks for it when it writes
     except ImportError as err:
         raise UsageError("LAZ needs laspy and lazrs: pip install 'topograph[exchange]'") from err
     p = points(topo)

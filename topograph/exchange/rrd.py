@@ -12,9 +12,9 @@ from topograph.errors import UsageError
 from topograph.topomap import KINDS, TopoMap
 from topograph.whole import whole
 
-COLORS = {"tree": (27, 120, 55), "post": (123, 92, 62)}
+COLORS = {"tree": (27, 120, 55), "post": (123, 92, 62), "missing": (178, 24, 43)}
 TRUNK_M = 1.5
-"""Height that a trunk is drawn with; what was measured is its axis and diameter at breast height."""
+"""Height that a trunk is drawn with; what was measured is its axis, and its diameter at 0.8 m."""
 UNKNOWN_DIAMETER_M = 0.2
 
 
@@ -43,7 +43,8 @@ def _trees(recording: Any, rr: Any, topo: TopoMap) -> None:
     if not len(topo):
         return
     labels = [f"{KINDS[k]} {i}" for k, i in zip(topo.kind.tolist(), topo.ids.tolist(), strict=True)]
-    colors = [COLORS.get(KINDS[k], (128, 128, 128)) for k in topo.kind.tolist()]
+    kinds = ["missing" if s == "missing" else KINDS[k] for k, s in zip(topo.kind.tolist(), topo.state, strict=True)]
+    colors = [COLORS.get(k, (128, 128, 128)) for k in kinds]
     up = np.tile([0.0, 0.0, 1.0], (len(topo), 1))
     across = np.cross(up, topo.axis)
     lean = np.arccos(np.clip(topo.axis[:, 2], -1.0, 1.0))

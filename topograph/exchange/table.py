@@ -42,12 +42,13 @@ REPLAYS = (".mcap", ".bag")
 """Formats that a localization can be put into."""
 
 
-def write(topo: TopoMap, path: Path, localized: Localized | None = None) -> None:
+def write(topo: TopoMap, path: Path | str, localized: Localized | None = None) -> None:
     """Write the map by the suffix of `path`, whole or not at all; with a localization to replay where the format has time (`REPLAYS`).
 
     Raises:
         UsageError: another suffix, a format that the map cannot fill, or an extra that is not installed.
     """
+    path = Path(path)
     if path.suffix not in WRITERS:
         raise UsageError(f"{path}: end the name in one of {', '.join(WRITERS)}")
     if localized is not None:

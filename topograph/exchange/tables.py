@@ -74,6 +74,10 @@ def write_kml(topo: TopoMap, path: Path) -> None:
 
 def write_parquet(topo: TopoMap, path: Path) -> None:
     """GeoParquet, by geopandas."""
+    try:
+        import pyarrow  # noqa: F401  # geopandas looks for it when it writes
+    except ImportError as err:
+        raise UsageError("GeoParquet needs geopandas and pyarrow: pip install 'topograph[exchange]'") from err
     frame = geodataframe(topo)
     with whole(path) as part:
         frame.to_parquet(part)
@@ -104,22 +108,44 @@ def topomap_of(frame: Any, sigma: float = 0.05) -> TopoMap:
     known to `sigma` m. Without a CRS its x and y are metres in a frame of their own.
 
     Raises:
-        InputError: what is no point, or no number.
+        InputError: no trees, what is no point, no number, not on Earth, or no diameter in metres.
     """
+    if not len(frame):
+        raise InputError("no trees in the table")
+    if "kind" in frame:  # a map that was written by `geodataframe`: posts are no trees
+        frame = frame[frame["kind"] == "tree"]
     if not (frame.geometry.geom_type == "Point").all():
         raise InputError("trees are points: of polygons, such as crowns, take the centroids first")
     datum = None
     if frame.crs is None:
-        p = np.column_stack([frame.geometry.x, frame.geometry.y, np.zeros(len(frame))])
+        z = np.where(frame.geometry.has_z, frame.geometry.z, 0.0)
+        p = np.column_stack([frame.geometry.x, frame.geometry.y, z])
     else:
         g = frame.geometry.to_crs(4326)
+        if not ((np.abs(g.y) <= 90.0) & (np.abs(g.x) <= 180.0)).all():
+            raise InputError("a tree's latitude or longitude is none: is the CRS the right one?")
         h = np.nan_to_num(np.where(g.has_z, g.z, 0.0))
         datum = Datum(float(np.median(g.y)), float(np.median(g.x)), float(np.median(h)))
         p = datum.to_enu(np.column_stack([g.y, g.x, h]))
     if not np.isfinite(p).all():
         raise InputError("a tree's place is not a number")
-    diameter = frame["diameter"].to_numpy(float) if "diameter" in frame else np.full(len(frame), np.nan)
+    if np.ptp(p, axis=0).max() > WIDEST_M:
+        raise InputError(
+            f"the trees lie {np.ptp(p, axis=0).max() / 1000:.0f} km apart: is one of them on the other side of the date line?"
+        )
+    try:
+        diameter = frame["diameter"].to_numpy(float) if "diameter" in frame else np.full(len(frame), np.nan)
+    except (TypeError, ValueError) as err:
+        raise InputError(f"a diameter is not a number ({err})") from err
+    if ((diameter <= 0.0) | (diameter > THICKEST_M)).any():
+        raise InputError(
+            f"diameters are metres, from 0 to {THICKEST_M:g}: {np.nanmax(np.abs(diameter)):g} is none (centimetres?)"
+        )
     return replace(TopoMap.of_points(p[:, :2], sigma), p=p, datum=datum, diameter=diameter)
+
+
+WIDEST_M, THICKEST_M = 1e5, 5.0
+"""Of an orchard, and of a trunk."""
 
 
 def georeferenced(topo: TopoMap, what: str) -> TopoMap:

@@ -22,6 +22,7 @@ def audited(solved: Solved) -> Verdict:
         *(() if p.placed else _of_gnss(solved)),
         *audit.trunks(p, e, solved.moving, solved.existence.kind == TREE),
         *_unclaimed(solved),
+        *_seldom(solved),
         *_mounts(solved),
     ]
     if any(f.name == "moving" for f in found):  # the same cause, and said of it
@@ -36,6 +37,14 @@ def _of_gnss(solved: Solved) -> Iterator[Finding]:
     yield from audit.jumps(p, e, solved.streams, _lever(solved))
     yield from audit.standing(solved.streams, solved.motion)
     yield from audit.headings(p, e)
+
+
+def _seldom(solved: Solved) -> Iterator[Finding]:
+    first, last = solved.motion.stamps_ns[[0, -1]]
+    d = solved.detections
+    inside = (d.stamps_ns >= first) & (d.stamps_ns <= last)
+    shown = np.unique(d.scan[solved.tree >= 0])
+    yield from audit.seldom(int(inside.sum()), int(inside[shown].sum()))
 
 
 def _unclaimed(solved: Solved) -> Iterator[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from topograph import store
@@ -18,13 +19,19 @@ from topograph.topomap import TopoMap
 
 
 def map_bags(
-    *bags: Path | str, config: Config | None = None, into: TopoMap | None = None, progress: Progress = silent
+    *bags: Path | str,
+    config: Config | None = None,
+    into: TopoMap | None = None,
+    accept: Sequence[str] = (),
+    progress: Progress = silent,
 ) -> TopoMap:
     """The map of one run's recordings, or `into` with the run put in. `meta["verdict"]` is the audit's word, `meta["why"]` its reasons.
 
+    `accept`: findings that shall not refuse it (the names stand in the error).
+
     Raises:
         InputError: a recording cannot be read.
-        InsufficientDataError: it has no trees, or does not determine its path.
+        InsufficientDataError: it has no trees, does not determine its path, or the audit refuses it.
     """
     config = config or Config()
     run = read_run([Path(b) for b in bags], config, progress)
@@ -35,7 +42,10 @@ def map_bags(
     solved = solve_run(run, config, known=into, placed=placed, progress=progress)
     if why := why_no_trees(solved):
         raise InsufficientDataError(why)
-    verdict = audited(solved)
+    verdict = audited(solved).accepting(accept)
+    if verdict.word == "refused":
+        names = ", ".join(repr(f.name) for f in verdict.findings if f.refuses)
+        raise InsufficientDataError(f"refused: {'; '.join(verdict.reasons)} (accept=[{names}] returns it all the same)")
     topo = topo_map(solved, config, {"verdict": verdict.word, "why": "; ".join(verdict.reasons)})
     return topo if into is None else extend(into, topo, solved, config)
 

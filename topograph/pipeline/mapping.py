@@ -22,6 +22,7 @@ from topograph.mapping import (
 )
 from topograph.session import Session
 from topograph.topomap import SessionRecord, TopoMap, build, merge
+from topograph.topomap.map import TREE
 from topograph.trees import Existence, in_order, seen_through, shapes
 
 
@@ -52,9 +53,12 @@ def known_map(topo: TopoMap) -> KnownMap:
 
 
 def why_no_trees(solved: Solved) -> str:
-    """One line on why a map has no trees; "" when it has some."""
-    if solved.problem.n_trees:
+    """One line on why a map has no trees; "" when it has some. Posts are none."""
+    trees, posts = int((solved.existence.kind == TREE).sum()), int((solved.existence.kind != TREE).sum())
+    if trees:
         return ""
+    if posts:
+        return f"no trees: of {solved.run.scans} scans, what was seen often enough are {posts} posts (is the LiDAR mounted as TF says?)"
     if solved.run.scans == 0 and {"points", "trunks"} & set(solved.run.chosen):
         return "no trunks: no scan could be used in the part of the recording that was read (see what was skipped, and --from, --to)"
     if solved.run.scans == 0:

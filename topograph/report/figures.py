@@ -100,7 +100,7 @@ def tree_error_figure(error: Array, title: str = "Errors of the trees") -> bytes
 
 def residual_figure(residuals: Mapping[str, Array]) -> bytes:
     """Normalised residuals by factor type, against the Gaussian that they should follow."""
-    shown = {k: v[np.isfinite(v)] for k, v in residuals.items() if len(v)}
+    shown = {k: v[np.isfinite(v)] for k, v in residuals.items() if np.isfinite(v).any()}
     figure = Figure(figsize=(2.6 * max(len(shown), 1), 2.7))
     x = np.linspace(-5, 5, 201)
     for k, (name, r) in enumerate(shown.items()):
@@ -118,24 +118,29 @@ WINDOWS = 120
 """Parts of a run whose residuals are summed up."""
 
 
-def residual_time_figure(residuals: Mapping[str, Array], stamps_ns: Mapping[str, Stamps]) -> bytes:
-    """Size of the normalised residuals (R,) by factor type over time: middle and 95th percentile of each part of the run."""
-    shown = {k: (v, stamps_ns[k]) for k, v in residuals.items() if len(v) and len(stamps_ns.get(k, ())) == len(v)}
+def residual_time_figure(residuals: Mapping[str, Array], stamps_ns: Mapping[str, Stamps], start_ns: int) -> bytes:
+    """Size of the normalised residuals (R,) by factor type over the time since `start_ns`: middle and 95th percentile of each part of the run."""
+    shown = {
+        k: (v, stamps_ns[k])
+        for k, v in residuals.items()
+        if np.isfinite(v).any() and len(stamps_ns.get(k, ())) == len(v)
+    }
     figure = Figure(figsize=(9, 1.5 * max(len(shown), 1) + 0.6))
-    start = min((int(t[0]) for _, t in shown.values()), default=0)
     first = None
     for k, (name, (r, ns)) in enumerate(shown.items()):
         first = ax = figure.add_subplot(len(shown), 1, k + 1, sharex=first)
         finite = np.isfinite(r)
-        t, size = (ns[finite] - start) * 1e-9, np.abs(r[finite])
-        ends = np.linspace(t.min(initial=0.0), t.max(initial=1.0), WINDOWS + 1)
+        t, size = (ns[finite] - start_ns) * 1e-9, np.abs(r[finite])
+        ends = np.linspace(t.min(), max(t.max(), t.min() + 1e-3), WINDOWS + 1)
         part = np.clip(np.searchsorted(ends, t, side="right") - 1, 0, WINDOWS - 1)
         order = np.argsort(part, kind="stable")
         which, begins = np.unique(part[order], return_index=True)
         groups = np.split(size[order], begins[1:])
-        middle = 0.5 * (ends[which] + ends[which + 1])
-        ax.plot(middle, [np.percentile(g, 95) for g in groups], color=BAD, lw=1, label="95th percentile")
-        ax.plot(middle, [np.median(g) for g in groups], color=PATH, lw=1, label="middle")
+        middle = 0.5 * (ends[:-1] + ends[1:])
+        high, low = np.full(WINDOWS, np.nan), np.full(WINDOWS, np.nan)  # a gap stays one
+        high[which], low[which] = [np.percentile(g, 95) for g in groups], [np.median(g) for g in groups]
+        ax.plot(middle, high, ".-", ms=2, color=BAD, lw=1, label="95th percentile")
+        ax.plot(middle, low, ".-", ms=2, color=PATH, lw=1, label="middle")
         for level, color in ((1.96, BAD), (0.674, PATH)):
             ax.axhline(level, color=color, lw=0.7, ls="--", alpha=0.7)
         ax.set_ylabel(f"{name} [σ]", fontsize=8)
@@ -143,7 +148,7 @@ def residual_time_figure(residuals: Mapping[str, Array], stamps_ns: Mapping[str,
         ax.grid(alpha=0.2)
     if shown:
         figure.axes[0].legend(fontsize=7, loc="upper right")
-        figure.axes[-1].set_xlabel("t [s]")
+        figure.axes[-1].set_xlabel("t [s], since the recording began")
     figure.tight_layout()
     return _png(figure)
 

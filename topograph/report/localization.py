@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from topograph.evaluate.localization import LocalizationErrors
 from topograph.localize import Report
-from topograph.report.figures import BAD, PATH, TREE, _png
+from topograph.report.figures import BAD, PATH, POST, TREE, _png
 from topograph.topomap import TopoMap
 
 COLORS = {"searching": "#999999", "ambiguous": "#e0a030", "tracking": TREE, "degraded": "#762a83", "lost": BAD}
@@ -19,7 +19,10 @@ def localization_figure(topo: TopoMap, reports: Sequence[Report]) -> bytes:
     """The committed poses on the map, and state, places left and uncertainty over time."""
     figure = Figure(figsize=(11, 5.2))
     ax = figure.add_axes((0.06, 0.1, 0.5, 0.84))
-    ax.scatter(topo.p[:, 0], topo.p[:, 1], s=18, color=TREE, alpha=0.6, label="mapped trees")
+    trees = topo.is_tree
+    ax.scatter(topo.p[trees, 0], topo.p[trees, 1], s=18, color=TREE, alpha=0.6, label="mapped trees")
+    if not trees.all():
+        ax.scatter(topo.p[~trees, 0], topo.p[~trees, 1], s=14, marker="s", color=POST, alpha=0.6, label="mapped posts")
     fixes = [r.fix for r in reports if r.fix is not None]
     if fixes:
         xy = np.array([f.map_T_robot[:2, 3] for f in fixes])

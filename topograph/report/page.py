@@ -16,7 +16,8 @@ from topograph.whole import write_text
 
 ABOUT = {
     "Map": "Ellipses: 95 %, ten times enlarged.",
-    "Residuals by factor": "In standard deviations that were stated (after noise scales were learnt); the line is the Gaussian that they should follow.",
+    "Residuals by factor": "In standard deviations that were stated (after noise scales were learnt); the line is the Gaussian that they should follow. What is beyond 5 is counted at 5. "
+    "IMU factors are not among them.",
     "Residuals over time": "Their size in each part of the run: the middle and the 95th percentile, and where a Gaussian has them (dashed). A part that "
     "stands out is where to look: a slip, a bad fix, a clock that stepped.",
     "Errors of the trees": "Against the truth that was given, horizontally, at the foot.",
@@ -24,7 +25,7 @@ ABOUT = {
     "Errors": "Against the truth that was given.",
 }
 """Caption -> what a picture shows."""
-TONES = {"sound": "good", "found": "good", "doubtful": "fair", "refused": "bad", "unknown": "bad"}
+TONES = {"no trees": "bad", "sound": "good", "found": "good", "doubtful": "fair", "refused": "bad", "unknown": "bad"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,7 +33,7 @@ class Page:
     """What a report page says.
 
     Attributes:
-        word: sound, doubtful, refused; found, unknown. `sentence` goes on from it.
+        word: sound, doubtful, refused, no trees; found, unknown. `sentence` goes on from it; `tone` is good, fair or bad, by default the word's.
         findings: why, where it is not sound.
         figures: caption -> PNG; `skipped`: reason -> count.
         notes: what was assumed or mended.
@@ -42,6 +43,7 @@ class Page:
     title: str
     word: str
     sentence: str = ""
+    tone: str = ""
     findings: Sequence[Finding] = ()
     facts: Mapping[str, str] = field(default_factory=dict)
     metrics: Sequence[Metric] = ()
@@ -57,7 +59,7 @@ class Page:
             for f in self.findings
         ]
         return render(
-            "report.html", title=self.title, word=self.word, sentence=self.sentence, tone=TONES.get(self.word, "fair"), reasons=reasons,
+            "report.html", title=self.title, word=self.word, sentence=self.sentence, tone=self.tone or TONES.get(self.word, "fair"), reasons=reasons,
             facts=self.facts, notes=self.notes, skipped=sorted(self.skipped.items()),
             metrics=[{"name": m.name, "value": show(m), "better": m.better} for m in self.metrics],
             walk=None if self.walk is None else {"href": self.walk[0], "text": self.walk[1]},

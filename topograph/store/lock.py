@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from topograph.errors import MapError
+from topograph.whole import LONGEST
 
 
 @contextmanager
@@ -61,7 +62,7 @@ def alive(pid: int) -> bool:
 
 def sweep(path: Path) -> None:
     """Remove what killed writers of this map left behind."""
-    for part in path.parent.glob(f".{glob.escape(path.stem)}.*.part{glob.escape(path.suffix)}*"):
-        pid = part.name.removeprefix(f".{path.stem}.").split(".")[0]
+    for part in path.parent.glob(f".{glob.escape(path.stem[:LONGEST])}.*.part{glob.escape(path.suffix)}*"):
+        pid = part.name.removeprefix(f".{path.stem[:LONGEST]}.").split(".")[0]
         if pid.isdigit() and int(pid) != os.getpid() and not alive(int(pid)):
             part.unlink(missing_ok=True)

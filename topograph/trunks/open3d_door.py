@@ -29,7 +29,7 @@ def open3d() -> Any:
         log.debug("libusb_package is not to be had")
     try:
         import open3d as o3d
-    except ModuleNotFoundError as err:
-        raise UsageError("the thesis's front end needs open3d: pip install 'topograph[thesis]'") from err
+    except (ImportError, OSError) as err:  # not there, or a library of the system that it needs
+        raise UsageError(f"the thesis's front end needs open3d ({err}): pip install 'topograph[thesis]'") from err
     o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
     return o3d

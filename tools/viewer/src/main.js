@@ -100,8 +100,12 @@ async function clouds(i) {
   $('sides').replaceChildren();
   if (!with3d) return;
   const button = (label, k, color) => { const b = document.createElement('button'); b.textContent = label; b.style.borderColor = color; b.setAttribute('aria-pressed', String(ui.side === k)); b.onclick = () => { ui.side = k; clouds(i); }; return b; };
-  const compass = (v) => ['E', 'NE', 'N', 'NW', 'W', 'SW', 'S', 'SE'][Math.round(((Math.atan2(v.dy, v.dx) + 2 * Math.PI) % (2 * Math.PI)) / (Math.PI / 4)) % 8];
-  $('sides').append(button('all sides', -1, 'currentColor'), ...views.map((v, k) => button(`from ${compass(v)}`, k, sideColor(k))));
+  // A local frame has no north: sides are angles from its x axis.
+  const angle = (v) => (Math.atan2(v.dy, v.dx) + 2 * Math.PI) % (2 * Math.PI);
+  const compass = (v) => (D.lat ? ['E', 'NE', 'N', 'NW', 'W', 'SW', 'S', 'SE'][Math.round(angle(v) / (Math.PI / 4)) % 8] : `${Math.round(angle(v) * 180 / Math.PI)}°`);
+  const names = views.map(compass);
+  const named = names.map((n, k) => (names.filter((m) => m === n).length > 1 ? `${n} (${names.slice(0, k + 1).filter((m) => m === n).length})` : n));
+  $('sides').append(button('all sides', -1, 'currentColor'), ...views.map((_, k) => button(`from ${named[k]}`, k, sideColor(k))));
   showCloud($('cloud'), views, [t.ax[i], t.ay[i], t.az[i]], ui.side);
 }
 
@@ -133,6 +137,7 @@ dark.addEventListener('change', () => { ui.dark = dark.matches; draw(); });
 
 if (L) {
   $('replay').hidden = false;
+  $('legend').append(document.createElement('br'), ...L.states.filter((_, k) => L.state.includes(k)).map((s) => { const e = document.createElement('span'), dot = document.createElement('i'); dot.style.background = dot.style.borderColor = `rgb(${COLORS[s].join(',')})`; e.append(dot, `${s} `); return e; }));
   const slider = $('time');
   slider.max = String(L.time.length - 1);
   slider.value = String(ui.step);

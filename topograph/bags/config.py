@@ -10,7 +10,8 @@ class BagsConfig:
     """Topics (empty: found by type), frames and stamps of a recording.
 
     Attributes:
-        topic_*: topic of a stream; "" finds it by its type, "none" ignores the stream.
+        topic_points, topic_trunks, topic_odometry, topic_imu, topic_fix, topic_heading: topic of the stream; "" finds it by its type,
+            "none" ignores the stream.
         base_frame: the frame whose poses are estimated.
         extrinsics: frame -> (x, y, z, roll, pitch, yaw) of the sensor in `base_frame`, metres and radians;
             overrules TF.

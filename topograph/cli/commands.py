@@ -168,9 +168,9 @@ def say_verdict(solved: Any, topo: Any, verdict: Any, folder: Path, target: Path
         for f in verdict.findings:
             click.echo(f"  {f.sentence} [{f.name} {f.value:.3g} {f.unit}, bound {f.bound:.3g}]", err=True)
     if verdict.word == "refused":
-        names = " ".join(f"--accept '{f.name}'" for f in verdict.findings if f.refuses)
         click.echo(
-            f"topograph: no map was saved; path and report are in {folder}; {names} saves it all the same", err=True
+            f"topograph: no map was saved; path and report are in {folder}; {accepting(verdict)} saves it all the same",
+            err=True,
         )
         raise SystemExit(4)
     where = "georeferenced" if topo.datum is not None else "not georeferenced"
@@ -179,6 +179,11 @@ def say_verdict(solved: Any, topo: Any, verdict: Any, folder: Path, target: Path
     click.echo(
         f"{target}: {trees} trees, {posts}{len(topo.edges)} edges, {where}, {verdict.word}; report: {folder / 'report.html'}, to walk through: {folder / 'map.html'}"
     )
+
+
+def accepting(verdict: Any) -> str:
+    """What to type to have a refused map all the same."""
+    return " ".join(f"--accept '{f.name}'" for f in verdict.findings if f.refuses)
 
 
 def save_results(
@@ -255,11 +260,11 @@ def save_results(
         "no trees": f"– no map was saved, the path is in path.tum; {no_trees}",
         "sound": f"– {count}; {', '.join(there)} and trunks agree." if there else f"– {count}.",
         "doubtful": f"– {count}; the map is saved, look at what the audit found:",
-        "refused": "– no map was saved; the path is in path.tum. The audit found:",
+        "refused": f"– no map was saved; the path is in path.tum ({accepting(verdict)} saves it all the same). The audit found:",
     }[word]
     report.Page(
         title=title, word=word, sentence=sentence, findings=verdict.findings, facts=facts, metrics=metrics, figures=figures,
-        notes=notes, skipped=solved.run.skipped, walk=("map.html", "Walk through the map") if len(topo) else None,
+        notes=notes, skipped=solved.run.skipped, walk=("map.html", "Walk through the map") if len(topo) else None, files=("report.json", "path.tum", "config.yaml"),
     ).write(folder / "report.html")  # fmt: skip
     for stale in () if len(topo) else ("map.html", "map.png"):  # of an earlier run in this folder
         (folder / stale).unlink(missing_ok=True)

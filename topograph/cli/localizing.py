@@ -135,7 +135,7 @@ def localize(
         Page(
             title=f"Localization of {', '.join(p.name for p in bags)}", word=word, sentence=rest, tone=tone(run.reports), facts=facts, metrics=metrics,
             figures=figures, notes=[n for n in notes if n is not said], skipped=run.skipped,
-            walk=("replay.html", "Replay it on the map"),
+            walk=("replay.html", "Replay it on the map"), files=("report.json", "localization.csv", "localization.tum", "config.yaml"),
         ).write(folder / "report.html")  # fmt: skip
         true_xy = None
         if true is not None and world is not None and len(true.stamps_ns):

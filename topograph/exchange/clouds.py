@@ -28,7 +28,7 @@ def points(topo: TopoMap) -> NDArray[np.void]:
         part["tree"] = topo.ids[v.tree]
         parts.append(part)
     if not parts:
-        raise UsageError("the map holds no clouds: recorded detections have none")
+        raise UsageError("the map holds no clouds: recorded detections and surveyed trees have none")
     return np.asarray(np.concatenate(parts))
 
 

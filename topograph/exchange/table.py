@@ -18,6 +18,8 @@ from topograph.whole import whole
 
 
 def _path(topo: TopoMap, path: Path) -> None:
+    if not len(topo.stamps_ns):
+        raise UsageError("the map has no path: it was made of surveyed trees")
     with whole(path) as part:
         write_tum(part, topo.stamps_ns, topo.map_T_robot)
 
@@ -49,6 +51,8 @@ def write(topo: TopoMap, path: Path | str, localized: Localized | None = None) -
         UsageError: another suffix, a format that the map cannot fill, or an extra that is not installed.
     """
     path = Path(path)
+    if not len(topo):
+        raise UsageError("the map is empty: there is nothing to write")
     if path.suffix not in WRITERS:
         raise UsageError(f"{path}: end the name in one of {', '.join(WRITERS)}")
     if localized is not None:

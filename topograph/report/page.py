@@ -25,6 +25,16 @@ ABOUT = {
     "Errors": "Against the truth that was given.",
 }
 """Caption -> what a picture shows."""
+MEANING = {
+    "doubles": "share of the trees that have another one much nearer than is usual: a loop that was not closed",
+    "loops closed": "times that old ground was recognised without GNSS",
+    "keyframes": "poses that are variables of the graph",
+    "tree NEES (2 dof)": "squared error over stated covariance; 2 is right, more is too sure",
+    "NEES of x and y (2 is right)": "squared error over stated covariance; more is too sure",
+    "trunk residual median": "how far sightings lie from where their tree is",
+    "largest stated deviation (1 σ)": "relative to the map",
+}
+"""Figure -> what it is, where its name does not say."""
 TONES = {"no trees": "bad", "sound": "good", "found": "good", "doubtful": "fair", "refused": "bad", "unknown": "bad"}
 
 
@@ -37,7 +47,7 @@ class Page:
         findings: why, where it is not sound.
         figures: caption -> PNG; `skipped`: reason -> count.
         notes: what was assumed or mended.
-        walk: file beside the page with the same to walk through, and what it is called.
+        walk: file beside the page with the same to walk through, and what it is called; `files` are further ones beside it.
     """
 
     title: str
@@ -51,6 +61,7 @@ class Page:
     notes: Sequence[str] = ()
     skipped: Mapping[str, int] = field(default_factory=dict)
     walk: tuple[str, str] | None = None
+    files: Sequence[str] = ()
 
     def html(self) -> str:
         """The page as text."""
@@ -61,7 +72,8 @@ class Page:
         return render(
             "report.html", title=self.title, word=self.word, sentence=self.sentence, tone=self.tone or TONES.get(self.word, "fair"), reasons=reasons,
             facts=self.facts, notes=self.notes, skipped=sorted(self.skipped.items()),
-            metrics=[{"name": m.name, "value": show(m), "better": m.better} for m in self.metrics],
+            metrics=[{"name": m.name, "value": show(m), "better": m.better, "about": MEANING.get(m.name, "")} for m in self.metrics],
+            files=self.files,
             walk=None if self.walk is None else {"href": self.walk[0], "text": self.walk[1]},
             figures=[
                 {"caption": k, "about": ABOUT.get(k, ""), "data": base64.b64encode(png).decode()} for k, png in self.figures.items()

@@ -29,9 +29,10 @@ class TreesConfig:
         mapped: chance that a trunk seen on old ground is already in the map.
         margin: log-odds by which a loop must beat its rivals and the absence of a loop.
         merge: two trees nearer than this are one (stems of one tree), m.
-        min_sightings, min_ratio: of a tree that exists; ratio of sightings to scans that should show it (recorded detections);
-        passed: scans that saw through its place, for each that saw it, that a tree survives;
-        usual_score: share of the run's median score of trees that is enough (less existence.DOUBTFUL);
+        min_sightings: of a tree that exists.
+        min_ratio: least ratio of its sightings to the scans that should show it (recorded detections).
+        passed: scans that saw through its place, for each that saw it, that a tree survives.
+        usual_score: share of the run's median score of trees that is enough (less existence.DOUBTFUL).
         reassociate: association and solve go on until neither changes; else trees are as they were first joined (an ablation).
         min_share: of the sightings that trees of the same run have at the median.
     """

@@ -19,10 +19,10 @@ class TrunksConfig:
 
     Attributes:
         front_end: "organised" (ours) or "thesis".
-        nearest, farthest: distances between which trunks are looked for.
-        low, high: heights above ground between which a trunk is traced.
-        reference: height above ground at which the axis is stated.
-        widest, thinnest: diameters of a trunk.
+        nearest, farthest: distances between which trunks are looked for, m.
+        low, high: heights above ground between which a trunk is traced, m.
+        reference: height above ground at which the axis is stated, m.
+        widest, thinnest: diameters of a trunk, m.
         prior_diameter, prior_sigma: of trunks too coarsely seen to measure.
         min_score: log-odds (tree or post) below which a candidate is dropped; what a scan doubts, many scans decide.
         score: file of another score, as tools/train_score.py writes it; "": the shipped one.

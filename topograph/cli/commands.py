@@ -450,7 +450,7 @@ def demo(context: click.Context, folder: Path, seed: int, quiet: bool) -> None:
         shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
     with progress_bar(quiet) as progress:
         truth = record(
-            bag, seed, "olive", DriveConfig(run=1), SensorConfig(sweep_hz=10.0, columns=1808),
+            bag, seed, "olive", DriveConfig(run=1), SensorConfig(sweep_hz=5.0),
             progress=lambda share: progress("simulate", share),
         )  # fmt: skip
         config = Config()
@@ -461,7 +461,7 @@ def demo(context: click.Context, folder: Path, seed: int, quiet: bool) -> None:
                 solved, config, inputs, [bag], folder, folder / "orchard.gpkg", truth, None, progress
             )
         record(
-            later, seed, "olive", DriveConfig(run=3, longest_s=30.0), SensorConfig(gnss="none"),
+            later, seed, "olive", DriveConfig(run=3, longest_s=30.0), SensorConfig(sweep_hz=5.0, gnss="none"),
             progress=lambda share: progress("simulate a later run, without GNSS", share),
         )  # fmt: skip
     table(map_metrics(topo, truth))

@@ -253,3 +253,47 @@ def test_a_link_stays_one_and_a_private_file_private(tmp_path: Path) -> None:
     assert real.read_text().startswith("id")
     assert real.stat().st_mode & 0o777 == 0o600
     write(MAP, tmp_path / f"{'x' * 245}.csv")
+
+
+QGIS = """
+import os, sys
+os.environ["QT_QPA_PLATFORM"] = "offscreen"
+from qgis.core import QgsApplication, QgsMapRendererParallelJob, QgsMapSettings, QgsVectorLayer
+from qgis.PyQt.QtCore import QSize
+from qgis.PyQt.QtGui import QColor
+app = QgsApplication([], False)
+app.initQgis()
+layers = [QgsVectorLayer(f"{sys.argv[1]}|layername={name}", name, "ogr") for name in ("trees", "edges", "path_lines", "ellipses")]
+assert all(layer.isValid() and layer.loadDefaultStyle()[1] for layer in layers)
+s = QgsMapSettings()
+s.setLayers(layers)
+s.setOutputSize(QSize(600, 600))
+s.setBackgroundColor(QColor(255, 255, 255))
+s.setDestinationCrs(layers[0].crs())
+box = layers[0].extent()
+box.scale(1.2)
+s.setExtent(box)
+job = QgsMapRendererParallelJob(s)
+job.start()
+job.waitForFinished()
+picture = job.renderedImage()
+green = sum(QColor(picture.pixel(x, y)).green() > QColor(picture.pixel(x, y)).red() + 60 for x in range(600) for y in range(600))
+print(layers[0].featureCount(), green)
+sys.stdout.flush()
+os._exit(0)
+"""
+
+
+def test_qgis_draws_the_map_with_its_own_styles(tmp_path: Path) -> None:
+    """Headless QGIS, where Debian's python3-qgis is installed."""
+    import subprocess
+
+    python = Path("/usr/bin/python3")
+    if not python.exists() or subprocess.run([python, "-c", "import qgis.core"], capture_output=True).returncode:
+        pytest.skip("python3-qgis is not installed")
+    store.save(MAP, tmp_path / "m.gpkg")
+    done = subprocess.run([python, "-c", QGIS, tmp_path / "m.gpkg"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    trees, green = map(int, done.stdout.split())
+    assert trees == len(MAP)
+    assert green > 50  # trees are green dots, not QGIS's random colour

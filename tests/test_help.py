@@ -52,6 +52,7 @@ def test_completion_knows_commands_options_and_choices() -> None:
     complete = BashComplete(main, {}, "topograph", "_TOPOGRAPH_COMPLETE")
     assert {"map", "localize", "live"} <= {c.value for c in complete.get_completions([], "")}
     assert "--check-fixes" in {c.value for c in complete.get_completions(["map", "run.bag"], "--check")}
+    assert "trellis" in {c.value for c in complete.get_completions(["simulate", "x.bag", "--design"], "tr")}
     assert {c.value for c in complete.get_completions(["localize", "m", "b", "--measure"], "")} == {
         "both",
         "ranges",

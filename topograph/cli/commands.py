@@ -381,12 +381,20 @@ def detect(
         )
 
 
+def _designs(_context: click.Context, _option: click.Parameter, begun: str) -> list[str]:
+    """For completion: loaded when it is asked for."""
+    from topograph.simulate import DESIGNS
+
+    return [name for name in DESIGNS if name.startswith(begun)]
+
+
 @main.command()
 @click.argument("output", type=click.Path(path_type=Path))
 @click.option(
     "--design",
     default="grid",
     show_default=True,
+    shell_complete=_designs,
     help="grid, olive, steep, gentle, hedgerow, young, trellis, old_olive, bare, forest or yard.",
 )
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True)

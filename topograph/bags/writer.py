@@ -131,7 +131,7 @@ class BagWriter:
         )
 
     def tf_static(self, log_ns: int, transforms: dict[tuple[str, str], Array], topic: str = "/tf_static") -> None:
-        """Mounts: (parent, child) -> parent_T_child (4, 4)."""
+        """(parent, child) -> parent_T_child (4, 4): mounts, or on `/tf` what moves."""
         stamped = [
             self._msg(
                 "geometry_msgs/msg/TransformStamped",
@@ -243,22 +243,6 @@ class BagWriter:
             "geometry_msgs/msg/PoseArray", header=self._header(stamp_ns, frame), poses=[self._pose(T) for T in poses]
         )
         self._write(topic, "geometry_msgs/msg/PoseArray", stamp_ns, message)
-
-    def transform(self, stamp_ns: int, frame: str, child: str, T: Array) -> None:
-        """A transform (4, 4) on `/tf`."""
-        stamped = self._msg(
-            "geometry_msgs/msg/TransformStamped",
-            header=self._header(stamp_ns, frame),
-            child_frame_id=child,
-            transform=self._msg(
-                "geometry_msgs/msg/Transform",
-                translation=self._vector(T[:3, 3]),
-                rotation=self._quaternion(to_quaternion(T)),
-            ),
-        )
-        self._write(
-            "/tf", "tf2_msgs/msg/TFMessage", stamp_ns, self._msg("tf2_msgs/msg/TFMessage", transforms=[stamped])
-        )
 
     def markers(
         self, topic: str, log_ns: int, frame: str, trunks: Sequence[tuple[Array, Array, float, tuple[float, ...]]],

@@ -15,6 +15,7 @@ import numpy as np
 from topograph import __version__
 from topograph.cli.common import (
     TRUTH,
+    WHOLE,
     check_accepted,
     check_output,
     check_target,
@@ -27,14 +28,12 @@ from topograph.cli.common import (
     progress_bar,
     results_folder,
     say_if_cold,
+    span_facts,
     table,
     truth_of,
     versions,
 )
 from topograph.errors import InputError, MapError, UsageError
-
-WHOLE = (0.0, float("inf"))
-"""From and to, s: all of a recording."""
 
 
 @main.command("map")
@@ -241,7 +240,7 @@ def save_results(
     facts = {
         "from": ", ".join(p.name for p in bags),
         "recorded": f"{solved.run.duration_s:.0f} s",
-        **({} if span_s == WHOLE else {"of which": f"{span_s[0]:g} to {span_s[1]:g} s"}),
+        **span_facts(span_s),
         "topograph": __version__,
     }
     if word in ("sound", "doubtful"):

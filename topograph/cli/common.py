@@ -282,6 +282,15 @@ def versions() -> dict[str, str]:
     }
 
 
+WHOLE = (0.0, math.inf)
+"""From and to, s: all of a recording."""
+
+
+def span_facts(span_s: tuple[float, float]) -> dict[str, str]:
+    """What a page says of a part of a recording; nothing of the whole."""
+    return {} if span_s == WHOLE else {"of which": f"{span_s[0]:g} to {span_s[1]:g} s"}
+
+
 def plain_span(span_s: tuple[float, float]) -> list[float | None]:
     """From and to (s) as JSON has them."""
     return [s if math.isfinite(s) else None for s in span_s]

@@ -22,6 +22,7 @@ from topograph.cli.common import (
     progress_bar,
     results_folder,
     say_if_cold,
+    span_facts,
     table,
     truth_of,
     versions,
@@ -112,6 +113,8 @@ def localize(
         (folder / "localization.png").write_bytes(figures["Localization"])
         inputs = hashes()
         said = verdict(run.reports, run.distance)
+        word, _, rest = said.partition(" ")
+        word = word.rstrip(":")
         notes = [*run.notes, said]
         if topo.meta.get("verdict", "sound") not in ("sound", "not audited", ""):
             why = topo.meta.get("why", "")
@@ -120,18 +123,16 @@ def localize(
             notes.append(f"{run.exploded} scans had more combinations than thesis.combinations and measured nothing")
         write_json(
             folder / "report.json", metrics, run.skipped, inputs, run.seconds, peak_mb(), notes=notes, versions=versions(),
-            topics=run.chosen, span_s=plain_span((from_s, to_s)), method=method, verdict={"word": said.partition(" ")[0].rstrip(":"), "sentence": said},
+            topics=run.chosen, span_s=plain_span((from_s, to_s)), method=method, verdict={"word": word, "sentence": said},
         )  # fmt: skip
         facts = {
             "map": map_file.name,
             "method": method,
             "measure": config.localize.measure,
             "recorded": f"{run.duration_s:.0f} s",
-            **({} if (from_s, to_s) == (0.0, float("inf")) else {"of which": f"{from_s:g} to {to_s:g} s"}),
+            **span_facts((from_s, to_s)),
             "topograph": __version__,
         }
-        word, _, rest = said.partition(" ")
-        word = word.rstrip(":")
         Page(
             title=f"Localization of {', '.join(p.name for p in bags)}", word=word, sentence=rest, tone=tone(run.reports), facts=facts, metrics=metrics,
             figures=figures, notes=[n for n in notes if n is not said], skipped=run.skipped,
@@ -187,7 +188,7 @@ def verdict(reports: Sequence[Any], distance: Sequence[float]) -> str:
     committed = [i for i, r in enumerate(reports) if r.fix is not None]
     if committed:
         after = reports[committed[0] :]
-        share, tracked = len(committed) / len(after), sum(r.state == "tracking" for r in after) / len(after)
+        share, tracked = len(committed) / len(after), tracking_share(after)
         widest = max(max(r.along, r.across) for r in after if r.fix is not None)
         parts = [
             f"found after {distance[committed[0]]:.1f} m",
@@ -212,14 +213,18 @@ WIDE_M = 0.5
 MOSTLY = 0.9
 
 
+def tracking_share(reports: Sequence[Any]) -> float:
+    """Of scans in which the trees held the pose."""
+    return sum(bool(r.state == "tracking") for r in reports) / len(reports)
+
+
 def tone(reports: Sequence[Any]) -> str:
     """Good where the robot was tracked by the trees nearly all of the time after it was found, and at the end."""
     committed = [i for i, r in enumerate(reports) if r.fix is not None]
     if not committed:
         return "bad"
     after = reports[committed[0] :]
-    tracked = sum(r.state == "tracking" for r in after) / len(after)
-    return "good" if tracked >= MOSTLY and reports[-1].fix is not None else "fair"
+    return "good" if tracking_share(after) >= MOSTLY and reports[-1].fix is not None else "fair"
 
 
 def _csv(reports: Sequence[Any]) -> str:

@@ -61,7 +61,7 @@ def _replay(bag: BagWriter, run: Localized) -> None:
             "/robot_poses", stamp, FRAME, T[None] if ok else planar(places[:, 0], places[:, 1], places[:, 2])
         )
         if ok:
-            bag.transform(stamp, FRAME, "base_link", T)
+            bag.tf_static(stamp, {(FRAME, "base_link"): T}, "/tf")
 
 
 def _trunks(topo: TopoMap) -> list[tuple[Array, Array, float, tuple[float, ...]]]:

@@ -287,7 +287,8 @@ def stem_candidates(name: str, n: int, seed: int) -> tuple[Array, Array, Array]:
         elevation = [SENSORS["VLP-16"], SENSORS["64 rings"], np.linspace(-16, 15, 32)][rng.choice(3, p=[0.6, 0.2, 0.2])]
         tilt, turn = rng.uniform(0, STEEPEST) * (rng.random() < 0.6), rng.uniform(0, 2 * np.pi)
         roll, pitch = tilt * np.cos(turn) + np.pi * (rng.random() < 0.1), tilt * np.sin(turn)
-        mount = from_xyz_rpy(0, 0, rng.uniform(0.25, 2.5), roll, pitch, 0)
+        height = rng.uniform(0.2, 0.65) if rng.random() < KNEE_HIGH else rng.uniform(0.25, 2.5)
+        mount = from_xyz_rpy(0, 0, height, roll, pitch, 0)
         for look in plot.looks(1, seed + k, elevation, mount):
             c = candidates(look.scan, mount, np.zeros(6), TrunksConfig())
             p = transform(look.plot_T_base, c.fits[:, :3])
@@ -306,6 +307,8 @@ def stem_candidates(name: str, n: int, seed: int) -> tuple[Array, Array, Array]:
 
 STEEPEST = 0.55
 """Tilt of a mounting, rad."""
+KNEE_HIGH = 0.3
+"""Share of mountings that hang at knee height, where most is hidden and most is missed."""
 UNLISTED = (1.95, 5.6)
 """A stem with low branches that stands in lpine1's cloud and not in its list, m."""
 

@@ -74,9 +74,40 @@ HARD_FROM, HARD = 900, ("hedgerow", "trellis", "young", "old_olive", "steep")
 """Training seeds from which on only the designs are drawn in which single sweeps err most."""
 
 
+ODD_FROM = 1200
+"""Training seeds from which on the sensor hangs low or steeply, amid undergrowth: there single sweeps miss stems that are near."""
+
+
+def odd_sensor(rng: np.random.Generator) -> SensorConfig:
+    """A sensor that hangs at knee height, or turned by up to 35 degrees."""
+    drawn = sensor_of(rng)
+    assert drawn.mount is not None  # sensor_of draws one
+    x, y, _, _, _, yaw = drawn.mount
+    if rng.random() < 0.55:
+        height, roll, pitch = rng.uniform(0.2, 0.65), *rng.normal(0, 0.03, 2)
+    else:
+        a, b = rng.uniform(np.radians(12), np.radians(35)), rng.uniform(0, 2 * np.pi)
+        height, roll, pitch = rng.uniform(0.4, 2.2), a * np.cos(b), a * np.sin(b)
+    if rng.random() < 0.1:
+        roll += np.pi
+    common = {"elevation": (), **SENSORS["VLP-16"]} if rng.random() < 0.3 else {}
+    return replace(drawn, **common, mount=(x, y, height, roll, pitch, yaw))
+
+
+def overgrown(orchard: OrchardConfig, rng: np.random.Generator) -> OrchardConfig:
+    """The same design with dead branches, shrubs and weeds about its trunks."""
+    return replace(
+        orchard,
+        branches=max(orchard.branches, int(rng.integers(0, 16))),
+        shrubs=max(orchard.shrubs, float(rng.uniform(0.0, 0.2))),
+        weeds=max(orchard.weeds, float(rng.uniform(0.0, 0.25))),
+        suckers=max(orchard.suckers, float(rng.uniform(0.0, 0.4))),
+    )
+
+
 def orchard_like(seed: int, rng: np.random.Generator) -> OrchardConfig:
     """One of the simulator's designs with other trees: what orchards mostly look like is seen more often in training."""
-    names = HARD if HARD_FROM <= seed < 100_000 else tuple(DESIGNS)
+    names = HARD if HARD_FROM <= seed < ODD_FROM else tuple(DESIGNS)
     design = DESIGNS[str(rng.choice(names))]
     thick = float(rng.uniform(0.8, 1.25))
     return replace(
@@ -152,6 +183,9 @@ def looks(seed: int, n: int, orchard: OrchardConfig | None = None, sensor: Senso
         drawn_orchard = orchard_like(seed, rng)
     if rng.random() < PLAIN:
         drawn_sensor = SensorConfig()
+    if ODD_FROM <= seed < 100_000:
+        drawn_sensor = odd_sensor(rng)
+        drawn_orchard = overgrown(drawn_orchard if rng.random() < PLAIN else orchard_of(rng), rng)
     sensor, orchard = sensor or drawn_sensor, orchard or drawn_orchard
     scene = plant(orchard, seed)
     return [_look(scene, sensor, seed * 1000 + k, rng) for k in range(n)]

@@ -1,7 +1,7 @@
 """Trains the front end's score on randomised scenes (tools/scenes.py) and calibrates the stated deviations.
 
     pip install -e '.[train]'
-    python tools/train_score.py [--scenes 1200] [--looks 6] --recorded pine_plot lpine1 street
+    python tools/train_score.py [--scenes 1800] [--looks 6] --recorded pine_plot lpine1 street
 
 Seeds 0.. train, 100,000.. validate; nothing of them is reported anywhere else. Writes topograph/trunks/score.json.
 """
@@ -148,7 +148,7 @@ def recorded(names: list[str], share: Array) -> tuple[Array, Array, Array, Array
                     np.concatenate([p[k] + (k == 2) * 1000 * n for n, p in enumerate(parts)]) for k in range(3)
                 )
             else:
-                found = recordings.stem_candidates(name, 280, 7000)
+                found = recordings.stem_candidates(name, 400, 7000)
             np.savez_compressed(kept, X=found[0], y=found[1], sweep=found[2])
         with np.load(kept) as f:
             X.append(f["X"])
@@ -167,7 +167,7 @@ RECORDED_FROM = 10_000_000
 def main() -> None:
     """Collect, train, calibrate, validate, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=int, default=1200)
+    parser.add_argument("--scenes", type=int, default=1800)
     parser.add_argument("--looks", type=int, default=6)
     parser.add_argument("--cache", type=Path, help="keep what was collected here")
     parser.add_argument(

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from topograph.compiled import determinant3, solve3
 from topograph.localize.search_kernels import diameter_kernel
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def unlike_kernel(pose, centre):
     """Rows of placements that differ from all better ones."""
     kept = np.empty(len(pose), np.int64)
@@ -31,13 +32,13 @@ def unlike_kernel(pose, centre):
     return kept[:n].copy()
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def chance_kernel(raster, felled):
     """Chance (X, Y) that a mapped tree in each cell would have been seen."""
     return (1.0 - felled) * (1.0 - np.exp(-raster))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def match_kernel(
     c, s, x, y, m, var, tree, other, dia, dia_var, xy, tvar, tdia, dmean, dsd, origin, cell, nearest, base, seen, so
 ):
@@ -78,7 +79,7 @@ def match_kernel(
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def evidence_kernel(
     poses, m, P, tree, other, dia, dia_var, var, xy, tvar, tdia, dmean, dsd, origin, cell, nearest, bucket, buckets, start,
     member, raster, so, felled, base, trust, wild, scales, prior,
@@ -95,7 +96,7 @@ def evidence_kernel(
     best = -np.inf
     for h in range(M):
         x, y, yaw = poses[h, 0], poses[h, 1], poses[h, 2]
-        ids = np.full(n, -1, np.int64)
+        ids, rows = np.full(n, -1, np.int64), np.empty(n, np.int64)
         k = 0
         q, logdet = 0.0, 0.0
         L = np.zeros((3, 3))
@@ -125,15 +126,19 @@ def evidence_kernel(
                 seen,
                 so,
             )
-            if turn == 2 and np.all(new == ids):
+            changed, k = False, 0
+            for i in range(n):
+                changed = changed or new[i] != ids[i]
+                if new[i] >= 0:
+                    rows[k] = i
+                    k += 1
+            if turn == 2 and not changed:
                 break
             ids = new
-            rows = np.flatnonzero(ids >= 0)
-            k = len(rows)
             if k < 2:
                 ok = False
                 break
-            x, y, yaw, q, logdet, L = align_kernel(rows, ids, m, P, xy, tvar, base, 0.0, 1.0, x, y, yaw)
+            x, y, yaw, q, logdet, L = align_kernel(rows[:k], ids, m, P, xy, tvar, base, 0.0, 1.0, x, y, yaw)
         if not ok:
             continue
         fixed = 0.0
@@ -146,7 +151,7 @@ def evidence_kernel(
         top = -np.inf
         total = 0.0
         dof = 2 * k - 3
-        half = -0.5 * logdet - 0.5 * np.linalg.slogdet(L)[1] + (1.5 - k) * np.log(2 * np.pi)
+        half = -0.5 * logdet - 0.5 * np.log(determinant3(L)) + (1.5 - k) * np.log(2 * np.pi)
         for a in range(len(scales)):
             value = half - 0.5 * trust * q / scales[a] ** 2 - dof * np.log(scales[a]) + prior[a]
             if value > top:
@@ -156,21 +161,22 @@ def evidence_kernel(
             total += np.exp(half - 0.5 * trust * q / scales[a] ** 2 - dof * np.log(scales[a]) + prior[a] - top)
         log[h] = fixed + top + np.log(total)
         out[h, 0], out[h, 1], out[h, 2] = x, y, yaw
-        trees[h] = ids
+        for i in range(n):
+            trees[h, i] = ids[i]
         if log[h] > best:
             best = log[h]
         if log[h] > best - 6.0:
             # The same trees planted anew: their residuals are larger by both orchards' planting errors.
             for a in range(len(scales)):
-                _, _, _, qa, la, La = align_kernel(rows, ids, m, P, xy, tvar, base, wild, scales[a] ** 2, x, y, yaw)
+                _, _, _, qa, la, La = align_kernel(rows[:k], ids, m, P, xy, tvar, base, wild, scales[a] ** 2, x, y, yaw)
                 anew = (
-                    fixed - 0.5 * trust * qa - 0.5 * la - 0.5 * np.linalg.slogdet(La)[1] + (1.5 - k) * np.log(2 * np.pi)
+                    fixed - 0.5 * trust * qa - 0.5 * la - 0.5 * np.log(determinant3(La)) + (1.5 - k) * np.log(2 * np.pi)
                 )
                 alike[h] = np.logaddexp(alike[h], anew - np.log(len(scales)))
     return log, out, trees, scale, alike
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def align_kernel(rows, ids, m, P, xy, tvar, base, wild, noise, x, y, yaw):
     """Least squares of a placement with the joint covariance: pose, chi-square, log |S|, information (3, 3)."""
     k = len(rows)
@@ -201,7 +207,7 @@ def align_kernel(rows, ids, m, P, xy, tvar, base, wild, noise, x, y, yaw):
             for v in range(3):
                 A[u, v] += W[a, u] * W[a, v]
         q += W[a, 3] * W[a, 3]
-    d = np.linalg.solve(A, -g)
+    d = solve3(A, -g)
     q += g[0] * d[0] + g[1] * d[1] + g[2] * d[2]
     logdet = 0.0
     for a in range(2 * k):
@@ -214,7 +220,7 @@ def align_kernel(rows, ids, m, P, xy, tvar, base, wild, noise, x, y, yaw):
     return x2, y2, t, q, logdet, A
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def forward_kernel(C, B):
     """Solve C X = B for a lower triangular C."""
     X = B.copy()
@@ -228,7 +234,7 @@ def forward_kernel(C, B):
     return X
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def views_kernel(x, y, yaw, ids, xy, origin, bucket, buckets, start, member, seen, so, centre, reach):
     """Log chance of the mapped trees in view to have been seen or missed as they were."""
     c, s = np.cos(yaw), np.sin(yaw)

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def predict_kernel(mean, cov, d, move, q):
     c, s = np.cos(mean[2]), np.sin(mean[2])
     dx = c * move[0] - s * move[1]
@@ -37,7 +37,7 @@ def predict_kernel(mean, cov, d, move, q):
     cov[2, 1] += uy
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def innovations_kernel(mean, cov, n, z, R):
     m2 = np.empty((len(z), n))
     logdet = np.empty((len(z), n))
@@ -57,7 +57,7 @@ def innovations_kernel(mean, cov, n, z, R):
     return m2, logdet
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def project_kernel(cov, a, c, s, hx, hy):
     H = np.empty((2, 5))
     H[0, 0], H[0, 1], H[0, 2], H[0, 3], H[0, 4] = -c, -s, hy, c, s
@@ -73,7 +73,7 @@ def project_kernel(cov, a, c, s, hx, hy):
     return out[0], out[1], out[2]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def update_kernel(mean, cov, d, k, z, R):
     a = 3 + 2 * k
     c, s = np.cos(mean[2]), np.sin(mean[2])
@@ -89,7 +89,7 @@ def update_kernel(mean, cov, d, k, z, R):
     return gain_kernel(mean, cov, d, PH, p, q, r, z[0] - hx, z[1] - hy)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def fix_kernel(mean, cov, d, k, place, C):
     a = 3 + 2 * k
     PH = cov[:d, a : a + 2].copy()
@@ -97,7 +97,7 @@ def fix_kernel(mean, cov, d, k, place, C):
     return gain_kernel(mean, cov, d, PH, p, q, r, place[0] - mean[a], place[1] - mean[a + 1])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def gain_kernel(mean, cov, d, PH, p, q, r, vx, vy):
     det = p * r - q * q
     ip, iq, ir = r / det, -q / det, p / det
@@ -111,7 +111,7 @@ def gain_kernel(mean, cov, d, PH, p, q, r, vx, vy):
     return vx * wx + vy * wy, np.log(det)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def add_kernel(mean, cov, a, z, R):
     c, s = np.cos(mean[2]), np.sin(mean[2])
     gx, gy = c * z[0] - s * z[1], s * z[0] + c * z[1]
@@ -128,7 +128,7 @@ def add_kernel(mean, cov, a, z, R):
     cov[a + 1, a] = cov[a, a + 1]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def assign(m2, logdet, gate):
     """Landmark (N,) of each detection, -1 none: best pairs first, each landmark once.
 
@@ -151,7 +151,7 @@ def assign(m2, logdet, gate):
         taken[bk] = True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def in_view(mean, n, blocked):
     """Range (n,) of each landmark and whether a nearer trunk hides it."""
     reach = np.empty(n)
@@ -165,7 +165,7 @@ def in_view(mean, n, blocked):
     return reach, hidden
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def enter_kernel(raster, origin, x, y, yaw, blocked, bins, chance, view):
     s = len(blocked)
     for i in range(max(0, int(x - view - origin[0])), min(raster.shape[0], int(x + view - origin[0]) + 1)):

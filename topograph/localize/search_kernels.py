@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def fill_kernel(nearest, xy, low, cell, reach):
     best = np.full(nearest.shape, 1e18, np.float32)
     for t in range(len(xy)):
@@ -22,7 +22,7 @@ def fill_kernel(nearest, xy, low, cell, reach):
                     nearest[i, j] = t
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, error_model="numpy", fastmath=True)
 def seed_kernel(
     m,
     var,
@@ -125,15 +125,15 @@ def seed_kernel(
             keep = 0
             for q in range(count):
                 if losses[q] < best + bound:
-                    out[keep] = out[q]
+                    out[keep, 0], out[keep, 1], out[keep, 2] = out[q, 0], out[q, 1], out[q, 2]
                     losses[keep] = losses[q]
                     keep += 1
             count = keep
             if 2 * keep > len(out):
-                more = np.empty((2 * len(out), 3))
-                more[:count] = out[:count]
-                more_losses = np.empty(2 * len(out))
-                more_losses[:count] = losses[:count]
+                more, more_losses = np.empty((2 * len(out), 3)), np.empty(2 * len(out))
+                for q in range(count):
+                    more[q, 0], more[q, 1], more[q, 2] = out[q, 0], out[q, 1], out[q, 2]
+                    more_losses[q] = losses[q]
                 out, losses = more, more_losses
         out[count, 0] = tx - c * mx + sn * my
         out[count, 1] = ty - sn * mx - c * my
@@ -143,7 +143,7 @@ def seed_kernel(
     return out[:count].copy(), losses[:count].copy(), best
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def diameter_kernel(d, v, D, mean, sd):
     """Negative log ratio of a diameter under the tree's own and under the population's; bounded, for trees grow."""
     if not (d == d and D == D) or sd <= 0.0:
@@ -154,7 +154,7 @@ def diameter_kernel(d, v, D, mean, sd):
     return min(ratio, 3.0)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def distinct_kernel(pose, loss, centre, most):
     """Rows of the best `most` placements that differ, and the weight of the others relative to the last kept."""
     kept = np.empty(most, np.int64)
@@ -182,7 +182,7 @@ def distinct_kernel(pose, loss, centre, most):
     return kept[:n].copy(), rest
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def within_kernel(at, reach, xy, origin, bucket, buckets, start, member):
     out = np.empty(64, np.int64)
     n = 0
@@ -202,7 +202,8 @@ def within_kernel(at, reach, xy, origin, bucket, buckets, start, member):
                 if (xy[t, 0] - at[0]) ** 2 + (xy[t, 1] - at[1]) ** 2 <= reach * reach:
                     if n == len(out):
                         more = np.empty(2 * n, np.int64)
-                        more[:n] = out
+                        for i in range(n):
+                            more[i] = out[i]
                         out = more
                     out[n] = t
                     n += 1

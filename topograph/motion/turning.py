@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _rotation(v):
     """Rotation (3, 3) of a rotation vector."""
     angle2 = v[0] ** 2 + v[1] ** 2 + v[2] ** 2
@@ -23,7 +23,7 @@ def _rotation(v):
     )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def mean_turned(t, gyro, force):
     """Mean (3,) of `force` (N, 3) turned to t = 0 by the `gyro` (N, 3), and the rotations (3, 3) that turned the first and the last.
 
@@ -34,9 +34,14 @@ def mean_turned(t, gyro, force):
     for i in range(1, n):
         for k in range(3):
             angle[i, k] = angle[i - 1, k] + 0.5 * (gyro[i, k] + gyro[i - 1, k]) * (t[i] - t[i - 1])
+    after = 0
+    while after < n and t[after] <= 0.0:
+        after += 1
     now = np.empty(3)
-    for k in range(3):
-        now[k] = np.interp(0.0, t, angle[:, k])
+    for k in range(3):  # the turn at t = 0; the nearest end's outside of the samples
+        a, b = max(after - 1, 0), min(after, n - 1)
+        share = -t[a] / (t[b] - t[a]) if b > a else 0.0
+        now[k] = angle[a, k] + share * (angle[b, k] - angle[a, k])
     mean = np.zeros(3)
     first, last = np.eye(3), np.eye(3)
     for i in range(n):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from topograph.compiled import quantile
 from topograph.trunks.ground import ground_at
 from topograph.trunks.runs import COUNT, HEIGHT, PX, PY, PZ, RANGE, WIDTH
 
@@ -65,7 +66,9 @@ def vertical(runs, chain, most):
     if n < 3:
         return np.zeros(2)
     gain = n / (n + 2.0)
-    return np.array([gain * np.median(lean[0, :n]), gain * np.median(lean[1, :n])])
+    out = np.empty(2)
+    out[0], out[1] = gain * quantile(lean[0, :n], 0.5), gain * quantile(lean[1, :n], 0.5)
+    return out
 
 
 @njit(cache=True, error_model="numpy")
@@ -105,7 +108,7 @@ def widths_of(runs, mine, step, far):
     for q in range(n):
         s = np.sin(min(0.5 * runs[mine[q], WIDTH] / max(runs[mine[q], RANGE], 0.3), 1.0))
         w[q] = 2.0 * runs[mine[q], RANGE] * s / (1.0 - 0.785 * s)
-    middle = np.median(w)
+    middle = quantile(w, 0.5)
     ws, w2, wn = 0.0, 0.0, 0.0
     for q in range(n):
         if abs(w[q] - middle) < 0.5 * middle + step * far:
@@ -273,7 +276,8 @@ def merge_stems(fits, odds, group):
         if group[i] != i:
             continue
         best[b] = i
-        out[b] = fits[i]
+        for q in range(OUT_SIZE):
+            out[b, q] = fits[i, q]
         total, stems = 0.0, 0
         mean, lever, above = np.zeros(6), 0.0, 0.0
         for j in range(n):

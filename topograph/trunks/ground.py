@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from topograph.compiled import quantile, solve3
 from topograph.trunks.organise import FAST, HALF
 
 DIFFUSED = 12
@@ -43,7 +44,7 @@ def fit_ground(low):
         if xs[k] ** 2 + ys[k] ** 2 < 49.0:
             near[m] = zs[k]
             m += 1
-    plane[0] = np.percentile(near[:m], 25) if m > 5 else np.percentile(zs[:n], 15)
+    plane[0] = quantile(near[:m], 0.25) if m > 5 else quantile(zs[:n], 0.15)
     less = np.empty(n)
     for k in range(n):
         less[k] = 1.0 / (1.0 + 0.01 * (xs[k] ** 2 + ys[k] ** 2))
@@ -69,7 +70,8 @@ def fit_ground(low):
         s[1, 1] += 1.0  # a weak pull to level: a few cells in a row fix no slope
         s[2, 2] += 1.0
         s[0, 0] += 1e-9
-        plane[:] = np.linalg.solve(s, t)
+        solved = solve3(s, t)
+        plane[0], plane[1], plane[2] = solved[0], solved[1], solved[2]
     # A rim of two cells of nothing: no neighbour is looked for outside.
     high = np.full((size + 4, size + 4), NOTHING)
     for i in range(size):

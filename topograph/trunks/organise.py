@@ -226,6 +226,22 @@ def _lowest(q):
     return low.reshape(2 * HALF + 2, 2 * HALF + 2)[1:-1, 1:-1].copy()
 
 
+@njit(cache=True, error_model="numpy")
+def _by_azimuth(p, r, u):
+    """Sorts the points of one ring, in place, by the direction in which the sensor sees them."""
+    n = r.shape[0]
+    azimuth = np.empty(n)
+    for i in range(n):
+        azimuth[i] = np.arctan2(u[i, 1], u[i, 0])
+    order = np.argsort(azimuth)
+    old_p, old_r, old_u = p.copy(), r.copy(), u.copy()
+    for i in range(n):
+        k = order[i]
+        r[i] = old_r[k]
+        u[i, 0], u[i, 1] = old_u[k, 0], old_u[k, 1]
+        p[i, 0], p[i, 1], p[i, 2] = old_p[k, 0], old_p[k, 1], old_p[k, 2]
+
+
 @njit(cache=True, error_model="numpy", fastmath=FAST)
 def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
     """Points in ring order: base-frame xyz (M, 3), horizontal range from the sensor (M,), horizontal direction from it (M, 2),
@@ -247,10 +263,7 @@ def organise(xyz, ring, offset, base_T_lidar, twist, n_rings, near, far):
     for k in range(n_rings):
         lo, hi = starts[k], starts[k + 1]
         if jumbled[k] and hi - lo > 2:
-            order = np.argsort(np.arctan2(u[lo:hi, 1], u[lo:hi, 0]))
-            p[lo:hi] = p[lo:hi][order]
-            r[lo:hi] = r[lo:hi][order]
-            u[lo:hi] = u[lo:hi][order]
+            _by_azimuth(p[lo:hi], r[lo:hi], u[lo:hi])
     return p, r, u, starts, _lowest(q)
 
 

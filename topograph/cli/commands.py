@@ -358,7 +358,8 @@ def detect(
         write_text(csv_file, "\n".join(lines) + "\n")
     if picture is not None:
         at = trunks[0].stamp_ns + int(1e9 * (0.5 * run.duration_s if at_s is None else at_s))
-        scan, mount, shown = pipeline.scan_near(bags, config, at, trunks)
+        scan, mount = pipeline.scan_near(bags, config, at)
+        shown = min(trunks, key=lambda t: abs(t.stamp_ns - scan.stamp_ns))
         feet = None
         if true is not None:
             from topograph.geometry import interpolate

@@ -81,14 +81,22 @@ class _Group(click.Group):
             ctx.exit(TopographError.exit_code)
 
 
-M_ARENA_MAX = -8
+M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8
 """Of glibc's mallopt(3)."""
 
 
-def _one_arena() -> None:
-    """glibc keeps a heap for each thread, and what a solver's thread has freed is never given to the others: a tenth of the peak."""
+LARGE = 1 << 20
+"""Bytes from which on an array has pages of its own."""
+
+
+def _thrifty() -> None:
+    """glibc keeps a heap for each thread, and what a solver's thread has freed is never given to the others; and it learns to put arrays
+    of up to 32 MB on the heap, where they leave holes: together a sixth of the peak.
+    """
     with suppress(OSError, AttributeError):
-        ctypes.CDLL("libc.so.6").mallopt(M_ARENA_MAX, 1)
+        libc = ctypes.CDLL("libc.so.6")
+        libc.mallopt(M_ARENA_MAX, 1)
+        libc.mallopt(M_MMAP_THRESHOLD, LARGE)
 
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
@@ -96,7 +104,7 @@ def _one_arena() -> None:
 @click.option("-v", "--verbose", is_flag=True, help="Say what happens inside.")
 def main(verbose: bool) -> None:
     """Topological maps of orchards from robot recordings, by factor graph."""
-    _one_arena()
+    _thrifty()
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _end)
     logging.basicConfig(level=logging.WARNING if verbose else logging.ERROR, format="%(name)s: %(message)s")

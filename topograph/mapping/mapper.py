@@ -14,7 +14,7 @@ from topograph.geometry import Array, Datum, inverse
 from topograph.mapping.config import MappingConfig
 from topograph.mapping.known import KnownMap, Placed
 from topograph.mapping.solve import Solved, solve_session
-from topograph.session import Session, StreamsBuilder, unknown_mounts
+from topograph.session import ScansBuilder, Session, StreamsBuilder, unknown_mounts
 
 FIRST_S = 5.0
 """Before so much was recorded there is no map worth the name."""
@@ -49,7 +49,7 @@ class Mapper:
         self.datum: Datum | None = None
         self._find, self._mount = find, mount
         self._builder = StreamsBuilder()
-        self._trunks: list[Trunks] = []
+        self._trunks = ScansBuilder()
         self.skipped: Counter[str] = Counter()
         self.took = 0.0
         self._start_ns = start_ns
@@ -67,7 +67,7 @@ class Mapper:
         if not self._in_time(trunks.stamp_ns):
             self.skipped["scan: stamped far from all other messages"] += 1
             return False
-        self._trunks.append(trunks)
+        self._trunks.add(trunks)
         now = trunks.stamp_ns
         if self._start_ns is None:
             self._start_ns = now
@@ -83,7 +83,7 @@ class Mapper:
 
     def _in_time(self, stamp_ns: int) -> bool:
         """A scan's stamp is near the newest message of wheels or IMU, or near the last scan's."""
-        near = [m[-1].stamp_ns for m in (self._builder.odometry, self._builder.imu, self._trunks) if m]
+        near = [m.last_ns for m in (self._builder.odometry, self._builder.imu, self._trunks) if len(m)]
         return not near or min(abs(stamp_ns - n) for n in near) < FAR_NS
 
     def session(self) -> Session:
@@ -94,8 +94,8 @@ class Mapper:
             k: self._mount(k, streams.frames[k]) for k in ("imu", "fix", "heading") if k in streams.frames
         }
         child = self._find(streams.frames.get("child", ""))
-        trunks = list(self._trunks)
-        span = (trunks[-1].stamp_ns - trunks[0].stamp_ns) * 1e-9 if trunks else 0.0
+        trunks = self._trunks.build()
+        span = float(trunks.stamps_ns[-1] - trunks.stamps_ns[0]) * 1e-9 if len(trunks) else 0.0
         return Session(
             streams=streams,
             trunks=trunks,
@@ -112,11 +112,11 @@ class Mapper:
 
     def begin(self) -> None:
         """A solve of what came so far begins, here or elsewhere."""
-        self._solved_ns = self._trunks[-1].stamp_ns
+        self._solved_ns = self._trunks.last_ns
 
     def solve(self) -> Solved | None:
         """Path and trees of what came so far; None while that does not determine them."""
-        if not self._trunks:
+        if not len(self._trunks):
             return None
         self.begin()
         began = time.process_time()

@@ -49,14 +49,14 @@ def _seldom(solved: Solved) -> Iterator[Finding]:
 
 def _unclaimed(solved: Solved) -> Iterator[Finding]:
     first, last = solved.motion.stamps_ns[[0, -1]]  # what dead reckoning does not cover cannot be mapped
-    trunks = [t for t in solved.run.trunks if first <= t.stamp_ns <= last]
-    if not trunks:
+    scans = solved.run.trunks
+    within = (scans.stamps_ns >= first) & (scans.stamps_ns <= last)
+    if not within.any():
         return
+    inside = np.repeat(within, np.diff(scans.ends))
     d = solved.detections
     sure = d.score >= 0
-    yield from audit.unclaimed(
-        np.concatenate([t.p for t in trunks]), np.concatenate([t.score for t in trunks]), d.p[sure], solved.tree[sure]
-    )
+    yield from audit.unclaimed(scans.p[inside], scans.score[inside], d.p[sure], solved.tree[sure])
 
 
 TURNED = np.radians(45.0)

@@ -23,7 +23,7 @@ from topograph.mapping import (
 from topograph.session import Session
 from topograph.topomap import SessionRecord, TopoMap, build, merge
 from topograph.topomap.map import TREE
-from topograph.trees import Existence, in_order, seen_through, shapes
+from topograph.trees import Existence, seen_through, shapes
 
 
 def solve_run(
@@ -71,7 +71,7 @@ def topo_map(solved: Solved, config: Config, meta: dict[str, str], *, clouds: bo
     return build(
         solved.estimate,
         solved.detections,
-        in_order(solved.run.trunks) if clouds else [],
+        solved.run.trunks.in_order if clouds else None,
         map_T_scans(solved),
         solved.existence,
         solved.shapes,
@@ -123,7 +123,7 @@ def averaged(
     topo = build(
         e,
         d,
-        in_order(run.trunks) if clouds else [],
+        run.trunks.in_order if clouds else None,
         poses,
         all_trees,
         shapes(d, e.tree, poses, n),

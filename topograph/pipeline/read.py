@@ -20,7 +20,7 @@ from topograph.config import Config
 from topograph.errors import InputError
 from topograph.geometry import Array, inverse
 from topograph.mapping import Progress, silent
-from topograph.session import Session, Streams, StreamsBuilder, unknown_mounts
+from topograph.session import Scans, ScansBuilder, Session, Streams, StreamsBuilder, unknown_mounts
 from topograph.trunks import from_recorded
 
 if TYPE_CHECKING:
@@ -127,20 +127,21 @@ def read_run(
     notes: list[str] = []
     with Recording(paths, config.bags) as recording:
         builder = StreamsBuilder()
-        trunks: list[Trunks] = []
         if jobs > 1 and "points" in recording.chosen and span_s == WHOLE:
             found = _in_parts(recording, config, jobs, builder, progress)
             if found is None:
                 return read_run(paths, config, progress, span_s)
             trunks = found
         else:
+            scans = ScansBuilder()
             for product in stream(recording, config, progress, span_s):
                 if keep is not None and isinstance(product, (Trunks, Imu, Odometry)):
                     keep.append(product)
                 if isinstance(product, Trunks):
-                    trunks.append(product)
+                    scans.add(product)
                 else:
                     builder.add(product)
+            trunks = scans.build()
         refuse_damaged(recording, span_s != WHOLE)
         notes += _undecoded(recording)
         notes += [*recording.notes, *recording.clocks.notes]
@@ -213,9 +214,9 @@ UNTIMED = 0.02
 """Share of sweeps without times that is worth a word."""
 
 
-def _smear(streams: Streams, trunks: Sequence[Trunks]) -> str:
+def _smear(streams: Streams, trunks: Scans) -> str:
     """By how many centimetres it matters that points have no time."""
-    period = float(np.median(np.diff([t.stamp_ns for t in trunks]))) * 1e-9 if len(trunks) > 1 else 0.1
+    period = float(np.median(np.diff(trunks.stamps_ns))) * 1e-9 if len(trunks) > 1 else 0.1
     period = min(period, 0.2)
     speed, rate = np.zeros(1), np.zeros(1)
     if len(streams.odometry_ns):
@@ -235,7 +236,7 @@ _LAG_NS = 2_000_000_000
 class _Part:
     """Trunks of the scans that were recorded within one part of a recording, and the account of its point clouds."""
 
-    trunks: list[Trunks]
+    trunks: Scans
     skipped: Counter[str]
     given: int
     undecoded: dict[str, str]
@@ -245,7 +246,7 @@ class _Part:
 
 def _in_parts(
     recording: Recording, config: Config, jobs: int, builder: StreamsBuilder, progress: Progress
-) -> list[Trunks] | None:
+) -> Scans | None:
     """Trunks of all scans, by several processes; the small streams go into `builder` meanwhile. None where clocks need mending: that
     is told from the whole recording, not from parts.
     """
@@ -272,12 +273,12 @@ def _in_parts(
         recording.untimed += part.untimed
         recording.given["points"] += part.given
     recording.count_missing(recording.chosen["points"], "points")
-    return [t for part in parts for t in part.trunks]
+    return Scans.joined([part.trunks for part in parts])
 
 
 def _detect_part(paths: Sequence[Path], config: Config, start_ns: int, stop_ns: int) -> _Part:
     """The scans recorded from `start_ns` until before `stop_ns`."""
-    out: list[Trunks] = []
+    out = ScansBuilder()
     with Recording(paths, config.bags) as recording:
         front_end = _front_end(recording, config)
         pending: list[tuple[int, Scan]] = []
@@ -296,13 +297,13 @@ def _detect_part(paths: Sequence[Path], config: Config, start_ns: int, stop_ns: 
             elif isinstance(product, (Imu, Odometry)):
                 front_end.hear(product)
             while pending and recording.log_ns > pending[0][0] + WAIT_NS:
-                out += _careful(front_end, pending.pop(0)[1], recording.skipped)
+                out.extend(_careful(front_end, pending.pop(0)[1], recording.skipped))
         for _, scan in pending:
-            out += _careful(front_end, scan, recording.skipped)
+            out.extend(_careful(front_end, scan, recording.skipped))
         given = recording.given["points"]
         skipped = Counter({k: v for k, v in recording.skipped.items() if k.startswith("points")})
         return _Part(
-            trunks=out,
+            trunks=out.build(),
             skipped=skipped,
             given=given,
             undecoded=recording.undecoded,
@@ -327,10 +328,8 @@ def _front_end(recording: Recording, config: Config) -> FrontEnd:
     return FrontEnd(recording.frames.get, recording.frames.find, config.trunks, config.thesis_trunks)
 
 
-def scan_near(
-    paths: Sequence[Path], config: Config, stamp_ns: int, trunks: Sequence[Trunks]
-) -> tuple[Scan, Array, Trunks]:
-    """The scan nearest to a stamp, the LiDAR's mounting, and the trunks found in it."""
+def scan_near(paths: Sequence[Path], config: Config, stamp_ns: int) -> tuple[Scan, Array]:
+    """The scan nearest to a stamp, and the LiDAR's mounting."""
     with Recording(paths, config.bags) as recording:
         best: Scan | None = None
         for _, m in recording.messages(["points"]):
@@ -342,4 +341,4 @@ def scan_near(
         if best is None:
             raise InputError("no point cloud to draw: the recording holds trunk detections only")
         mount = recording.frames.get(best.frame)
-    return best, mount, min(trunks, key=lambda t: abs(t.stamp_ns - best.stamp_ns))
+    return best, mount

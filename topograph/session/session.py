@@ -7,10 +7,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
-import numpy as np
-
-from topograph.bags import Trunks
 from topograph.geometry import Array
+from topograph.session.scans import Scans
 from topograph.session.streams import Streams
 
 
@@ -29,7 +27,7 @@ class Session:
 
     Attributes:
         streams: the small streams.
-        trunks: trunks of each scan in `base_link`, in time order.
+        trunks: trunks of each scan in `base_link`, as they came.
         mounts: "imu", "fix", "heading" -> robot_T_sensor, or None where no transform is known.
         chosen: stream kind -> topic.
         skipped: reason -> count.
@@ -40,7 +38,7 @@ class Session:
     """
 
     streams: Streams
-    trunks: list[Trunks]
+    trunks: Scans
     mounts: dict[str, Array | None]
     child_T_robot: Array
     chosen: dict[str, str]
@@ -60,8 +58,9 @@ class Session:
         s = self.streams
         for column in (s.odometry_ns, s.odom_T_child, s.imu_ns, s.gyro, s.fix_ns, s.lat_lon_h, s.heading_ns, s.heading):
             h.update(column.tobytes())
-        for t in self.trunks:
-            h.update(t.stamp_ns.to_bytes(8, "big", signed=True))
-            h.update(np.ascontiguousarray(t.p).tobytes())
+        ends = self.trunks.ends.tolist()
+        for k, ns in enumerate(self.trunks.stamps_ns.tolist()):
+            h.update(ns.to_bytes(8, "big", signed=True))
+            h.update(self.trunks.p[ends[k] : ends[k + 1]].tobytes())
         began = datetime.fromtimestamp(self.start_ns * 1e-9, UTC)
         return f"{began:%Y%m%dT%H%M%S}Z-{h.hexdigest()[:6]}"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from topograph.bags import Fix, Heading, Imu, Odometry
 from topograph.geometry import Array, Datum, Stamps, from_quaternion
+from topograph.session.columns import Stream
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,11 +83,10 @@ def _sound(m: Odometry | Imu | Fix | Heading) -> bool:
 
 
 class StreamsBuilder:
-    """Collects messages as they are read; the newest of odometry and IMU are there for deskewing."""
+    """Collects messages as they come: the many in columns, the few as they are."""
 
     def __init__(self) -> None:
-        self.odometry: list[Odometry] = []
-        self.imu: list[Imu] = []
+        self.odometry, self.imu = Stream(13), Stream(6)
         self.fixes: list[Fix] = []
         self.headings: list[Heading] = []
         self.unsound: Counter[str] = Counter()
@@ -97,9 +97,9 @@ class StreamsBuilder:
             self.unsound[f"{type(message).__name__.lower()}: {UNSOUND}"] += 1
             return
         if isinstance(message, Imu):
-            self.imu.append(message)
+            self.imu.add(message.stamp_ns, message.frame, message.gyro, message.accel)
         elif isinstance(message, Odometry):
-            self.odometry.append(message)
+            self.odometry.add(message.stamp_ns, message.child_frame, message.odom_T_child, message.twist)
         elif isinstance(message, Fix):
             self.fixes.append(message)
         else:
@@ -108,23 +108,20 @@ class StreamsBuilder:
     def build(self, skipped: Counter[str]) -> Streams:
         """Arrays in time order; repeated stamps and unusable fixes are dropped and counted."""
         skipped.update(self.unsound)
-        odometry = _in_order(self.odometry, "odometry", skipped)
-        imu = _in_order(self.imu, "imu", skipped)
+        odometry_ns, moved, again = self.odometry.in_order()
+        imu_ns, felt, shaken = self.imu.in_order()
+        skipped.update({f"{k}: {REPEATED}": n for k, n in (("odometry", again), ("imu", shaken)) if n})
         fixes = _moving([f for f in map(_flat, _in_order(self.fixes, "fix", skipped)) if _usable(f, skipped)], skipped)
         headings = _in_order(self.headings, "heading", skipped)
-        pose = np.array([o.odom_T_child for o in odometry]).reshape(-1, 7)
-        frames = {
-            name: products[0].child_frame if isinstance(products[0], Odometry) else products[0].frame
-            for name, products in (("child", odometry), ("imu", imu), ("fix", fixes), ("heading", headings))
-            if products
-        }
+        frames = {name: stream.frame for name, stream in (("child", self.odometry), ("imu", self.imu)) if len(stream)}
+        frames |= {name: few[0].frame for name, few in (("fix", fixes), ("heading", headings)) if few}
         return Streams(
-            odometry_ns=np.array([o.stamp_ns for o in odometry], np.int64),
-            odom_T_child=from_quaternion(pose[:, :3], pose[:, 3:]) if len(pose) else np.zeros((0, 4, 4)),
-            twist=np.array([o.twist for o in odometry]).reshape(-1, 6),
-            imu_ns=np.array([m.stamp_ns for m in imu], np.int64),
-            gyro=np.array([m.gyro for m in imu]).reshape(-1, 3),
-            accel=np.array([m.accel for m in imu]).reshape(-1, 3),
+            odometry_ns=odometry_ns,
+            odom_T_child=from_quaternion(moved[:, :3], moved[:, 3:7]) if len(moved) else np.zeros((0, 4, 4)),
+            twist=moved[:, 7:].copy(),
+            imu_ns=imu_ns,
+            gyro=felt[:, :3].copy(),
+            accel=felt[:, 3:].copy(),
             fix_ns=np.array([f.stamp_ns for f in fixes], np.int64),
             lat_lon_h=np.array([f.lat_lon_h for f in fixes]).reshape(-1, 3),
             fix_cov=np.array([f.cov for f in fixes]).reshape(-1, 3, 3),
@@ -136,7 +133,8 @@ class StreamsBuilder:
         )
 
 
-_P = TypeVar("_P", Odometry, Imu, Fix, Heading)
+REPEATED = "repeated stamp"
+_P = TypeVar("_P", Fix, Heading)
 
 
 def _in_order(products: list[_P], name: str, skipped: Counter[str]) -> list[_P]:
@@ -144,7 +142,7 @@ def _in_order(products: list[_P], name: str, skipped: Counter[str]) -> list[_P]:
     out: list[_P] = []
     for p in ordered:
         if out and p.stamp_ns <= out[-1].stamp_ns:
-            skipped[f"{name}: repeated stamp"] += 1
+            skipped[f"{name}: {REPEATED}"] += 1
             continue
         out.append(p)
     return out

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from topograph.bags import Trunks
 from topograph.estimate import Estimate
 from topograph.geometry import Array, Datum
+from topograph.session import Scans
 from topograph.topomap.clouds import register
 from topograph.topomap.edges import TopomapConfig, among
 from topograph.topomap.map import TREE, TopoMap, Viewpoint
@@ -22,7 +22,7 @@ from topograph.trunks import LEAST_CLOUD
 def build(
     estimate: Estimate,
     detections: Detections,
-    trunks: Sequence[Trunks],
+    scans: Scans | None,
     map_T_scan: Array,
     existence: Existence,
     s: Shapes,
@@ -31,7 +31,7 @@ def build(
     meta: dict[str, str],
     session: SessionRecord | None = None,
 ) -> TopoMap:
-    """The map of an estimate, whose trees have shapes `s`. `trunks` are the scans' trunks with their clouds;
+    """The map of an estimate, whose trees have shapes `s`. `scans` have the trunks' clouds, where these are wanted;
     `detections.source` counts in them.
     """
     n, tree = len(estimate.trees), estimate.tree
@@ -43,7 +43,7 @@ def build(
     # The foot lies `height` below what was measured: the lean's error carries over, and the ground's, along the axis.
     cov[:, [0, 1], [0, 1]] += (s.place_var + height**2 * s.slope_var + _no_cylinder(s.diameter) ** 2)[:, None]
     cov += np.nan_to_num(ground_sigma)[:, None, None] ** 2 * (along[:, :, None] * along[:, None, :])
-    viewpoints = _viewpoints(foot, tree, detections, trunks, map_T_scan, config)
+    viewpoints = _viewpoints(foot, tree, detections, scans, map_T_scan, config)
     is_tree = existence.kind == TREE
     edges = among(foot[:, :2], is_tree, config)
     row = np.full(n, -1, np.int64)
@@ -99,14 +99,13 @@ def _no_cylinder(diameter: Array) -> Array:
 
 
 def _viewpoints(
-    foot: Array, tree: NDArray[np.int64], detections: Detections, trunks: Sequence[Trunks], map_T_scan: Array,
+    foot: Array, tree: NDArray[np.int64], detections: Detections, scans: Scans | None, map_T_scan: Array,
     config: TopomapConfig,
 ) -> tuple[Viewpoint, ...]:  # fmt: skip
-    clouds = [c for t in trunks for c in (t.clouds or [_NO_CLOUD] * len(t))]
-    if not any(map(len, clouds)):
+    if scans is None or not len(scans.points):
         return ()
     source = detections.source
-    size = np.array([len(c) for c in clouds])[source]
+    size = np.diff(scans.cloud_ends)[source]
     shown = np.flatnonzero((tree >= 0) & (size >= LEAST_CLOUD))
     shown = shown[np.lexsort((-size[shown], tree[shown]))]  # tree by tree, the fullest first
     ends = np.searchsorted(tree[shown], np.arange(len(foot) + 1))
@@ -120,12 +119,9 @@ def _viewpoints(
             parts = []
             for i in mine[rows[: config.clouds_per_viewpoint]].tolist():
                 T = map_T_scan[detections.scan[i]]
-                parts.append((clouds[source[i]] @ T[:3, :3].T + T[:3, 3] - foot[j]).astype(np.float32))
+                parts.append((scans.cloud(source[i]) @ T[:3, :3].T + T[:3, 3] - foot[j]).astype(np.float32))
             out.append(Viewpoint(j, direction, register(parts, config.voxel)))
     return tuple(out)
-
-
-_NO_CLOUD = np.zeros((0, 3), np.float32)
 
 
 def _sides(v: Array, cosine: float) -> list[tuple[Array, NDArray[np.int64]]]:

@@ -1,6 +1,6 @@
 """Trunks + a predicted path -> which trunks are one tree: tracking, loop closing, births and deaths."""
 
-from topograph.trees.detections import Detections, in_order
+from topograph.trees.detections import Detections
 from topograph.trees.existence import Existence, exists, seen_through
 from topograph.trees.foot import grounds
 from topograph.trees.keyframes import choose_keyframes
@@ -29,7 +29,6 @@ __all__ = [
     "follow",
     "gather",
     "grounds",
-    "in_order",
     "moved_pose",
     "refine",
     "relevelled",

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from topograph.geometry import Array, inverse, transform
-from topograph.trees.detections import SECTORS, Detections
+from topograph.session import SECTORS
+from topograph.trees.detections import Detections
 from topograph.trees.robust import weighted_median
 from topograph.trees.screen import parts_apart
 from topograph.trees.tracks import TreesConfig

@@ -1,0 +1,108 @@
+"""Columns of scans are the scans."""
+
+from collections import Counter
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from topograph.bags import Imu, Odometry, Trunks
+from topograph.session import SECTORS, Scans, ScansBuilder, StreamsBuilder
+from topograph.session.scans import LOT
+from topograph.trees import Detections
+
+FIELDS = ("p", "axis", "diameter", "cov", "height", "score", "kinds", "measured", "stems", "free", "eye")
+
+
+def drawn(seed: int, stamp_ns: int) -> Trunks:
+    """A scan of any source: with and without kinds, clouds and the like."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(0, 5))
+    told = rng.random(5) < 0.5
+    return Trunks(
+        stamp_ns=stamp_ns,
+        frame=str(rng.choice(["base_link", "lidar"])),
+        p=rng.normal(size=(n, 3)),
+        axis=rng.normal(size=(n, 3)),
+        diameter=rng.random(n),
+        cov=rng.random((n, 3, 3)),
+        height=np.full(n, np.nan),
+        score=rng.normal(size=n),
+        clouds=tuple(rng.normal(size=(int(k), 3)).astype(np.float32) for k in rng.integers(0, 4, n)) if told[0] else (),
+        surface=bool(told[1]),
+        kinds=rng.normal(size=(n if told[2] else 0, 3)),
+        measured=rng.normal(size=(n if told[3] else 0, 6)),
+        stems=rng.integers(1, 4, n if told[3] else 0),
+        free=rng.integers(0, 2**32, SECTORS if told[4] else 0, dtype=np.uint32),
+        eye=rng.normal(size=3),
+    )
+
+
+def same(a: Trunks, b: Trunks) -> None:
+    """Every field, to the bit."""
+    assert (a.stamp_ns, a.frame, len(a)) == (b.stamp_ns, b.frame, len(b))
+    if len(a):  # of no trunks, none is on its surface and none has a cloud
+        assert a.surface == b.surface
+        assert len(a.clouds) == len(b.clouds)
+    for k in FIELDS:
+        np.testing.assert_array_equal(getattr(a, k), getattr(b, k), err_msg=k)
+    for u, v in zip(a.clouds, b.clouds, strict=True):
+        np.testing.assert_array_equal(u, v)
+
+
+@given(st.lists(st.integers(0, 30), max_size=12), st.integers(0, 2**31))
+def test_scans_come_out_as_they_went_in(stamps: list[int], seed: int) -> None:
+    trunks = [drawn(seed + k, ns) for k, ns in enumerate(stamps)]
+    scans = Scans.of(trunks)
+    assert len(scans) == len(trunks)
+    for a, b in zip(scans, trunks, strict=True):
+        same(a, b)
+    for a, b in zip(Scans.joined([scans[:2], scans[2:3], scans[3:]]), trunks, strict=True):
+        same(a, b)
+    ordered = sorted(trunks, key=lambda t: t.stamp_ns)
+    once = [t for i, t in enumerate(ordered) if i == 0 or t.stamp_ns > ordered[i - 1].stamp_ns]
+    for a, b in zip(scans.in_order, once, strict=True):
+        same(a, b)
+    d = Detections.of(trunks)
+    assert d.stamps_ns.tolist() == [t.stamp_ns for t in once]
+    np.testing.assert_array_equal(d.p, np.concatenate([np.zeros((0, 3)), *[t.p for t in once]]))
+    np.testing.assert_array_equal(np.bincount(d.scan, minlength=len(once)), [len(t) for t in once])
+
+
+def test_more_may_come_after_building() -> None:
+    builder, trunks = ScansBuilder(), [drawn(k, k) for k in range(2 * LOT + 7)]
+    builder.extend(trunks[: LOT + 3])
+    first = builder.build()
+    builder.extend(trunks[LOT + 3 :])
+    assert (len(first), len(builder), builder.last_ns) == (LOT + 3, len(trunks), trunks[-1].stamp_ns)
+    for a, b in zip(builder.build(), trunks, strict=True):
+        same(a, b)
+
+
+def test_detections_share_the_memory_of_scans_in_order() -> None:
+    scans = Scans.of([drawn(k, k) for k in range(20)])
+    assert np.shares_memory(Detections.of(scans).cov, scans.cov)
+
+
+@given(st.lists(st.tuples(st.integers(0, 9), st.booleans()), max_size=20))
+def test_streams_are_put_in_order_and_repetitions_counted(messages: list[tuple[int, bool]]) -> None:
+    builder, skipped = StreamsBuilder(), Counter[str]()
+    for k, (ns, wheels) in enumerate(messages):
+        v = np.arange(6.0) + k
+        if wheels:
+            builder.add(Odometry(ns, f"child{k}", np.r_[v[:3], 0, 0, 0, 1], v))
+        else:
+            builder.add(Imu(ns, f"imu{k}", v[:3], v[3:]))
+    streams = builder.build(skipped)
+    for kind, stamps, values, name in (
+        (True, streams.odometry_ns, streams.twist, "odometry"),
+        (False, streams.imu_ns, np.c_[streams.gyro, streams.accel], "imu"),
+    ):
+        came = sorted(((ns, k) for k, (ns, wheels) in enumerate(messages) if wheels == kind), key=lambda m: m[0])
+        kept = [m for i, m in enumerate(came) if i == 0 or m[0] > came[i - 1][0]]
+        assert stamps.tolist() == [ns for ns, _ in kept]
+        np.testing.assert_array_equal(values, np.array([np.arange(6.0) + k for _, k in kept]).reshape(-1, 6))
+        assert skipped[f"{name}: repeated stamp"] == len(came) - len(kept)
+        if kept:
+            frame = "child" if kind else "imu"
+            assert streams.frames[frame] == f"{frame}{kept[0][1]}"

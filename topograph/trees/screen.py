@@ -84,14 +84,32 @@ def parts_apart(
     """
     order = np.lexsort((d.scan, label))
     ends = np.searchsorted(label[order], np.arange(n + 1))
-    sigma = np.sqrt(0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1]))
+    count = np.diff(ends)
+    long = np.flatnonzero(count >= GROUPS)
+    rank = np.arange(len(order)) - np.repeat(ends[:-1], count)  # of a sighting in its label, in time
+    size, more = np.repeat(count // GROUPS, count), np.repeat(count % GROUPS, count)  # the first parts have one more
+    part = np.empty(len(order), np.int64)
+    part[order] = np.where(
+        rank < more * (size + 1), rank // (size + 1), more + (rank - more * (size + 1)) // np.maximum(size, 1)
+    )
+    group = label * GROUPS + part
+    middle = np.stack([_medians(place[:, k], group, n * GROUPS) for k in range(2)], axis=1).reshape(n, GROUPS, 2)
+    way = _medians(drift, group, n * GROUPS).reshape(n, GROUPS)
+    sigma = _medians(np.sqrt(0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1])), label, n)[long]
+    noise = np.minimum(3.0 * sigma / np.sqrt(count[long] / GROUPS), NOISE)
     out = np.zeros(n, bool)
-    for k in np.flatnonzero(np.diff(ends) >= GROUPS):
-        rows = order[ends[k] : ends[k + 1]]
-        groups = np.array_split(rows, GROUPS)
-        middle = np.array([np.median(place[g], axis=0) for g in groups])
-        way = np.array([np.median(drift[g]) for g in groups])
-        noise = min(3.0 * float(np.median(sigma[rows])) / np.sqrt(len(rows) / GROUPS), NOISE)
-        for i, j in combinations(range(GROUPS), 2):
-            out[k] |= np.linalg.norm(middle[j] - middle[i]) > sway + noise + abs(way[j] - way[i])
+    for i, j in combinations(range(GROUPS), 2):
+        apart = np.linalg.norm(middle[long, j] - middle[long, i], axis=1)
+        out[long] |= apart > sway + noise + np.abs(way[long, j] - way[long, i])
+    return out
+
+
+def _medians(values: Array, label: NDArray[np.int64], n: int) -> Array:
+    """Median (n,) of the values (N,) of each label; NaN where there is none."""
+    v = values[np.lexsort((values, label))]
+    count = np.bincount(label, minlength=n)
+    begin = np.cumsum(count) - count
+    out = np.full(n, np.nan)
+    some = np.flatnonzero(count)
+    out[some] = 0.5 * (v[begin[some] + (count[some] - 1) // 2] + v[begin[some] + count[some] // 2])
     return out

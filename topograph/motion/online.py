@@ -15,15 +15,13 @@ from topograph.geometry import Array, exp, from_quaternion, inverse, log
 from topograph.motion.against import Against
 from topograph.motion.gravity_kernel import gravity_kernel
 from topograph.motion.inertial import GRAVITY
-from topograph.motion.reckon import quaternion_of
 from topograph.motion.samples import RANGE
+from topograph.motion.steps import jumps, levelled, quaternion_of, straightened
 
 AHEAD_NS = 2_000_000_000
 """A message that is further ahead of its stream waits for one that agrees: then there was a gap, or the clock was set."""
 SET_BACK = 20
 """So many messages in a row that are older than the last one used: their clock was set back."""
-JUMP = (15.0, 0.5)
-"""A step longer than so many m/s and m is a reset of the odometry."""
 CARRY_NS = 100_000_000
 """Where no message has come yet, the last step's velocity holds so long (or one and a half periods of the wheels)."""
 GAP_NS = 300_000_000
@@ -275,7 +273,7 @@ class Reckoner:
                     move = exp((stamp_ns - last_ns) / (ahead_ns - last_ns) * log(inverse(pose) @ ahead))
             elif self._velocity is not None and stamp_ns - self._heard[0] <= carry:
                 move = exp(self._velocity * (stamp_ns - last_ns) * 1e-9)
-            if move is not None and not _is_jump(move, (stamp_ns - last_ns) * 1e-9):
+            if move is not None and not jumps(move, (stamp_ns - last_ns) * 1e-9):
                 steps.append((last_ns, stamp_ns, move))
                 self._last = (stamp_ns, pose @ move)
         covered = sum(max(b - max(a, begin_ns), 0) for a, b, _ in steps) * 1e-9
@@ -293,7 +291,7 @@ class Reckoner:
         dt = dt_ns * 1e-9
         usual = self._period_ns or dt_ns
         self._period_ns = usual + (min(dt_ns, 4 * usual) - usual) // 10
-        if _is_jump(move, dt) or (dt_ns > gap_ns and heard[0] < begin_ns):
+        if jumps(move, dt) or (dt_ns > gap_ns and heard[0] < begin_ns):
             return False
         self._velocity = log(move) / dt
         self._speeds.append((heard[0] + dt_ns // 2, float(np.sign(move[0, 3]) * np.linalg.norm(move[:3, 3])) / dt))
@@ -402,17 +400,12 @@ class Reckoner:
         f = force.mean(0)
         still = bool(np.abs(speed).max(initial=0.0) < REST[0]) and bool(np.abs(rate).max() < 0.1)
         sigma = 2 * LEVEL_SIGMA if still else MOVING_SIGMA
-        roll, pitch = float(np.arctan2(f[1], f[2])), float(np.arctan2(-f[0], np.hypot(f[1], f[2])))
-        self._attitude = _Attitude(int(stamps[0]), quaternion_of(roll, pitch), 0.0, sigma)
+        self._attitude = _Attitude(int(stamps[0]), quaternion_of(*levelled(f)), 0.0, sigma)
         return True
 
 
 def _stamp(message: tuple[int, Array] | tuple[int, Array, Array]) -> int:
     return message[0]
-
-
-def _is_jump(move: Array, dt: float) -> bool:
-    return float(np.linalg.norm(move[:3, 3])) > JUMP[0] * max(dt, 0.02) + JUMP[1]
 
 
 def _along_wheels(steps: list[tuple[int, int, Array]]) -> tuple[Array, float, float, float]:
@@ -436,9 +429,7 @@ def _along_gyro(
     turn, turned = float(yaw[-1] - yaw[0]), float(np.abs(np.diff(yaw)).sum())
     if not steps:
         return np.array([0.0, 0.0, turn]), 0.0, 0.0, turned
-    moves = np.array([m for _, _, m in steps])
-    half = exp(0.5 * log(moves))[:, :3, :3]
-    straight = (np.swapaxes(half, 1, 2) @ moves[:, :3, 3, None])[..., 0]
+    straight = straightened(np.array([m for _, _, m in steps]))
     middle = np.array([a + (b - a) // 2 for a, b, _ in steps])
     k = np.clip(np.searchsorted(times, middle), 1, len(times) - 1)
     share = np.clip((middle - times[k - 1]) / np.maximum(times[k] - times[k - 1], 1), 0.0, 1.0)

@@ -14,13 +14,13 @@ from topograph.geometry import (
     from_quaternion,
     interpolate,
     inverse,
-    log,
     planar,
     wrap,
     yaw_of,
 )
 from topograph.motion.gravity_kernel import gravity_kernel
 from topograph.motion.inertial import GRAVITY, Inertial
+from topograph.motion.steps import jumps, levelled, quaternion_of, straightened
 from topograph.motion.wheels import against_fixes
 from topograph.ranges import Positive
 from topograph.session import Streams
@@ -188,12 +188,8 @@ def _joined(streams: Streams, step: Array, inertial: Inertial | None, config: Mo
     pose = np.tile(np.eye(4), (len(R_imu), 1, 1))
     pose[:, :3, :3] = R_imu
     R = interpolate(imu_ns, pose, streams.odometry_ns)[:, :3, :3]
-    # Half of the step's turn lies before its middle: the wheels' arc is laid along the gyro's heading.
-    local = step[:, :3, 3]
-    half = exp(0.5 * log(step))[:, :3, :3]
-    straight = (np.swapaxes(half, 1, 2) @ local[:, :, None])[..., 0]
     middle = interpolate(imu_ns, pose, (streams.odometry_ns[:-1] + streams.odometry_ns[1:]) // 2)[:, :3, :3]
-    moves = (middle @ straight[:, :, None])[..., 0]
+    moves = (middle @ straightened(step)[:, :, None])[..., 0]
     T = np.tile(np.eye(4), (n, 1, 1))
     T[:, :3, :3] = R
     T[1:, :3, 3] = np.cumsum(moves, axis=0)
@@ -280,9 +276,8 @@ def _speed(streams: Streams, distance: Array) -> Array:
 
 
 def _without_jumps(step: Array, dt: Array) -> Array:
-    """Steps with resets of the odometry (faster than 15 m/s) taken out."""
-    fast = np.linalg.norm(step[:, :3, 3], axis=1) > 15.0 * np.maximum(dt, 0.02) + 0.5
-    step[fast] = np.eye(4)
+    """Steps with resets of the odometry taken out."""
+    step[jumps(step, dt)] = np.eye(4)
     return step
 
 
@@ -296,12 +291,7 @@ def _attitude(inertial: Inertial, speed: Array | None, config: MotionConfig) -> 
         force[:, 0] -= np.gradient(speed, seconds - seconds[0])
         force[:, 1] -= speed * rate[:, 2]
     first = np.mean(force[: max(5, int(1.0 / max(float(np.median(dt)), 1e-3)))], axis=0)
-    roll, pitch = np.arctan2(first[1], first[2]), np.arctan2(-first[0], np.hypot(first[1], first[2]))
-    q0 = quaternion_of(float(roll), float(pitch))
-    q = gravity_kernel(q0, rate, force, dt.clip(0, 0.2), np.full(len(dt), config.tilt_time_s), GRAVITY)
+    q = gravity_kernel(
+        quaternion_of(*levelled(first)), rate, force, dt.clip(0, 0.2), np.full(len(dt), config.tilt_time_s), GRAVITY
+    )
     return from_quaternion(np.zeros((len(q), 3)), q)[:, :3, :3]
-
-
-def quaternion_of(roll: float, pitch: float) -> Array:
-    a, b = roll / 2, pitch / 2
-    return np.array([np.sin(a) * np.cos(b), np.cos(a) * np.sin(b), -np.sin(a) * np.sin(b), np.cos(a) * np.cos(b)])

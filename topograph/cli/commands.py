@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -12,266 +10,20 @@ from typing import Any
 import click
 import numpy as np
 
-from topograph import __version__
 from topograph.cli.common import (
     TRUTH,
-    WHOLE,
-    check_accepted,
     check_output,
-    check_target,
     config_of,
     hashed,
     input_options,
     main,
     peak_mb,
-    plain_span,
     progress_bar,
-    results_folder,
-    say_if_cold,
-    span_facts,
     table,
     truth_of,
-    versions,
 )
+from topograph.cli.results import save_results
 from topograph.errors import InputError, MapError, UsageError
-
-
-@main.command("map")
-@click.argument("bags", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="The map file (.gpkg).")
-@click.option("--force", is_flag=True, help="Replace the map file of -o if it is there.")
-@click.option("--method", type=click.Choice(["graph", "thesis"]), default="graph", show_default=True,
-              help="graph: the factor graph; thesis: Algorithm 3 with filtered poses, to compare with.")  # fmt: skip
-@click.option("--into", type=click.Path(path_type=Path), help="Extend this map by the run; the file is replaced whole.")
-@click.option(
-    "--accept",
-    multiple=True,
-    metavar="NAME",
-    help="Save the map though the audit refuses it for NAME; repeat for more.",
-)
-@click.option("--results", type=click.Path(path_type=Path), help="Folder for path, report and configuration.")
-@click.option("--truth", multiple=True, type=click.Path(path_type=Path), help=TRUTH)
-@click.option("--check-fixes", type=click.IntRange(0), default=0, metavar="N",
-              help="Withhold every N-th fix from the estimator and report the path's distance from it (1: withhold all).")  # fmt: skip
-@click.option("--from", "from_s", type=float, default=0.0, help="Begin so many seconds into the recording.")
-@click.option("--to", "to_s", type=float, default=float("inf"), help="End there.")
-@click.option(
-    "--jobs",
-    type=click.IntRange(1),
-    default=1,
-    show_default=True,
-    help="Processes that detect; the result is the same.",
-)
-@click.option("-q", "--quiet", is_flag=True, help="No progress.")
-@input_options
-def map_command(
-    bags: tuple[Path, ...], output: Path | None, force: bool, method: str, into: Path | None, accept: tuple[str, ...], results: Path | None,
-    truth: tuple[Path, ...], check_fixes: int, from_s: float, to_s: float, jobs: int, quiet: bool, config_file: Path | None,
-    **words: Any,
-) -> None:  # fmt: skip
-    """Make a map of the trees in BAGS (one run)."""
-    from topograph import pipeline, store
-
-    if output is not None and into is not None:
-        raise UsageError("-o makes a new map, --into extends one: give one of them")
-    if method == "thesis" and into is not None:
-        raise UsageError("--method thesis makes a new map: it cannot extend one")
-    check_accepted(accept)
-    if not 0.0 <= from_s < to_s:
-        raise UsageError(f"--from {from_s} --to {to_s}: nothing lies between")
-    say_if_cold(quiet)
-    config = config_of(config_file, words)
-    true = truth_of(truth)
-    with ExitStack() as stack:
-        folder = stack.enter_context(results_folder(results))
-        target = into or output or folder / "map.gpkg"
-        check_target(target)
-        if results is not None and target == folder / "map.gpkg" and target.exists() and not force:
-            raise UsageError(
-                f"{target}: is there already, of an earlier run; --force replaces it, or give another --results"
-            )
-        if output is not None and output.exists() and not force:
-            raise UsageError(f"{output}: is there already; --force replaces it, --into {output} extends it")
-        if into is not None and not into.exists():
-            raise MapError(f"{into}: no such map")
-        stack.enter_context(store.locked(target))
-        old = None if into is None else store.load(into)
-        inputs = stack.enter_context(hashed(bags, whole=to_s == float("inf")))
-        with progress_bar(quiet) as progress:
-            run = pipeline.read_run(bags, config, progress, (from_s, to_s), jobs)
-            if method == "thesis":
-                topo = save_thesis(run, config, inputs(), folder, target, true, check_fixes)
-                trees = f"{target}: {len(topo)} trees by the thesis's method, {len(topo.edges)} edges, {len(topo.viewpoints)} viewpoints"
-                for note in run.notes:
-                    click.echo(f"note: {note}", err=True)
-                click.echo(f"{trees}; report: {folder / 'report.json'}")
-                return
-            placed = None
-            if old is not None:
-                pipeline.refuse_twice(old, run)
-                if pipeline.has_no_common_gnss(old, run):
-                    placed = pipeline.place(old, run, config, progress)
-            solved = pipeline.solve_run(
-                run, config, check_fixes=check_fixes, known=old, placed=placed, progress=progress
-            )
-            topo, verdict = save_results(
-                solved, config, inputs, bags, folder, target, true, old, progress, accept, (from_s, to_s)
-            )
-    say_verdict(solved, topo, verdict, folder, target, run.notes)
-
-
-def save_thesis(
-    run: Any, config: Any, inputs: list[dict[str, str]], folder: Path, target: Path, true: Any, check_fixes: int
-) -> Any:
-    """Map by the thesis's method, with what can be said of it; it is not audited, for it states no uncertainty."""
-    import json
-
-    from topograph import pipeline, report, store
-    from topograph.config import dump
-    from topograph.errors import InsufficientDataError
-    from topograph.evaluate import truth_metrics, world_in_map, write_tum
-    from topograph.evaluate.metrics import doubles
-    from topograph.whole import write_text
-
-    text = dump(config)
-    meta = {"config": text, "inputs": json.dumps(inputs), "versions": json.dumps(versions()), "verdict": "not audited"}
-    _, e, topo = pipeline.thesis_map(run, config, meta, check_fixes=check_fixes)
-    if not len(topo):
-        raise InsufficientDataError(f"no node has {config.average.least} clusters (average.least)")
-    metrics = [doubles(topo)] if true is None else truth_metrics(topo, e.stamps_ns, e.map_T_robot, true)
-    write_tum(folder / "path.tum", e.stamps_ns, e.map_T_robot)
-    write_text(folder / "config.yaml", text)
-    true_trees = world_in_map(topo, true).points(true.trees) if true is not None and len(true.trees) else None
-    picture = report.map_figure(topo, true_trees)
-    (folder / "map.png").write_bytes(picture)
-    store.save(topo, target)
-    report.write_json(
-        folder / "report.json", metrics, run.skipped, inputs, {"read": run.seconds, "average": e.seconds}, peak_mb(),
-        notes=run.notes, versions=versions(), topics=run.chosen, method="thesis",
-    )  # fmt: skip
-    return topo
-
-
-def say_verdict(solved: Any, topo: Any, verdict: Any, folder: Path, target: Path, notes: Sequence[str]) -> None:
-    """What became of a map, and the exit code that it deserves."""
-    from topograph import pipeline
-
-    no_trees = pipeline.why_no_trees(solved)
-    for note in notes:
-        click.echo(f"note: {note}", err=True)
-    if no_trees:
-        click.echo(f"topograph: {no_trees}; the path is in {folder / 'path.tum'}", err=True)
-        raise SystemExit(4)
-    if verdict.word != "sound":
-        click.echo(f"{verdict.word.upper()}:", err=True)
-        for f in verdict.findings:
-            click.echo(f"  {f.sentence} [{f.name} {f.value:.3g} {f.unit}, bound {f.bound:.3g}]", err=True)
-    if verdict.word == "refused":
-        click.echo(
-            f"topograph: no map was saved; path and report are in {folder}; {accepting(verdict)} saves it all the same",
-            err=True,
-        )
-        raise SystemExit(4)
-    where = "georeferenced" if topo.datum is not None else "not georeferenced"
-    trees, others = int(topo.is_tree.sum()), int((~topo.is_tree).sum())
-    posts = f"{others} posts, " if others else ""
-    click.echo(
-        f"{target}: {trees} trees, {posts}{len(topo.edges)} edges, {where}, {verdict.word}; report: {folder / 'report.html'}, to walk through: {folder / 'map.html'}"
-    )
-
-
-def accepting(verdict: Any) -> str:
-    """What to type to have a refused map all the same."""
-    return " ".join(f"--accept '{f.name}'" for f in verdict.findings if f.refuses)
-
-
-def save_results(
-    solved: Any, config: Any, hashes: Callable[[], list[dict[str, str]]], bags: Sequence[Path], folder: Path, target: Path, true: Any, old: Any,
-    progress: Callable[[str, float], None], accept: Sequence[str] = (), span_s: tuple[float, float] = WHOLE,
-) -> Any:  # fmt: skip
-    """Write the map (if it has trees, and the audit does not refuse it), path, configuration and reports; returns map and verdict."""
-    import json
-
-    from topograph import pipeline, report, store
-    from topograph.config import dump
-    from topograph.evaluate import truth_metrics, world_in_map, write_tum
-    from topograph.evaluate.metrics import doubles, tree_errors
-    from topograph.report.viewer import write_viewer
-    from topograph.whole import write_text
-
-    began = time.perf_counter()
-    write_tum(folder / "path.tum", solved.estimate.stamps_ns, solved.estimate.map_T_robot)
-    verdict = pipeline.audited(solved).accepting(accept)
-    inputs = hashes()
-    text = dump(config)
-    no_trees = pipeline.why_no_trees(solved)
-    word = "no trees" if no_trees else verdict.word
-    meta = {
-        "config": text, "inputs": json.dumps(inputs), "versions": json.dumps(versions()), "verdict": verdict.word,
-        "why": "; ".join(verdict.reasons),
-    }  # fmt: skip
-    progress("map", 0.0)
-    topo = pipeline.topo_map(solved, config, meta)
-    if old is not None:
-        topo = pipeline.extend(old, topo, solved, config)
-    metrics = pipeline.residual_metrics(solved)
-    figures: dict[str, bytes] = {}
-    true_trees = None
-    e = solved.estimate
-    if true is not None:
-        metrics = truth_metrics(topo, e.stamps_ns, e.map_T_robot, true) + metrics
-        true_trees = world_in_map(topo, true).points(true.trees) if len(true.trees) else None
-        error = tree_errors(topo, true)[2] if len(true.trees) else np.zeros((0, 3))
-        if len(error):
-            figures["Errors of the trees"] = report.tree_error_figure(np.linalg.norm(error[:, :2], axis=1))
-    else:
-        metrics = [doubles(topo), *metrics]
-    if len(topo):
-        picture = report.map_figure(topo, true_trees)
-        (folder / "map.png").write_bytes(picture)
-        figures = {"Map": picture, **figures}
-    if e.residuals:
-        figures["Residuals by factor"] = report.residual_figure(e.residuals)
-        figures["Residuals over time"] = report.residual_time_figure(e.residuals, e.residual_ns, solved.run.start_ns)
-        (folder / "residuals.png").write_bytes(figures["Residuals by factor"])
-    seconds = {**solved.seconds, "map and report": time.perf_counter() - began}
-    write_text(folder / "config.yaml", text)
-    notes = [*solved.run.notes, *filter(None, [no_trees])]
-    facts = {
-        "from": ", ".join(p.name for p in bags),
-        "recorded": f"{solved.run.duration_s:.0f} s",
-        **span_facts(span_s),
-        "topograph": __version__,
-    }
-    if word in ("sound", "doubtful"):
-        store.save(topo, target)
-    report.write_json(
-        folder / "report.json", metrics, solved.run.skipped, inputs, seconds, peak_mb(), notes=notes, versions=versions(),
-        topics=solved.run.chosen, span_s=plain_span(span_s), announced=solved.run.announced, scales=solved.estimate.scales, verdict={**verdict.record(), "word": word},
-        offsets=[{"name": o.name, "value": o.value.tolist(), "sigma": o.sigma.tolist(), "gain": o.gain} for o in solved.estimate.offsets],
-    )  # fmt: skip
-    title = f"Map of {', '.join(p.name for p in bags)}"
-    trees, others = int(topo.is_tree.sum()), int((~topo.is_tree).sum())
-    count = f"{trees} trees" + (f" and {others} posts" if others else "")
-    there = [w for w, n in (("wheels", solved.streams.odometry_ns), ("IMU", solved.streams.imu_ns), ("fixes", solved.streams.fix_ns),
-                            ("headings", solved.streams.heading_ns)) if len(n)]  # fmt: skip
-    sentence = {
-        "no trees": f"– no map was saved, the path is in path.tum; {no_trees}",
-        "sound": f"– {count}; {', '.join(there)} and trunks agree." if there else f"– {count}.",
-        "doubtful": f"– {count}; the map is saved, look at what the audit found:",
-        "refused": f"– no map was saved; the path is in path.tum ({accepting(verdict)} saves it all the same). The audit found:",
-    }[word]
-    report.Page(
-        title=title, word=word, sentence=sentence, findings=verdict.findings, facts=facts, metrics=metrics, figures=figures,
-        notes=notes, skipped=solved.run.skipped, walk=("map.html", "Walk through the map") if len(topo) else None, files=("report.json", "path.tum", "config.yaml"),
-    ).write(folder / "report.html")  # fmt: skip
-    for stale in () if len(topo) else ("map.html", "map.png"):  # of an earlier run in this folder
-        (folder / stale).unlink(missing_ok=True)
-    if len(topo):
-        said = [f"{verdict.word}: {r}" for r in verdict.reasons]
-        write_viewer(folder / "map.html", topo, title, notes=said[:1])
-    progress("map", 1.0)
-    return topo, verdict
 
 
 @main.command()

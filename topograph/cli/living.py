@@ -13,7 +13,6 @@ from typing import Any
 import click
 import numpy as np
 
-from topograph.cli.commands import save_results, say_verdict
 from topograph.cli.common import (
     TRUTH,
     check_accepted,
@@ -28,6 +27,7 @@ from topograph.cli.common import (
     table,
     truth_of,
 )
+from topograph.cli.results import save_results, say_verdict
 from topograph.errors import InputError, TopographError, UsageError
 
 

@@ -88,14 +88,25 @@ def test_the_map_of_twenty_looks(shared: Path, name: str) -> None:
     assert np.linalg.norm(tree[i, :2] - at, axis=1).mean() <= 0.05
 
 
+MANY = 60
+"""Poses of each mounting: of 20, recall still scatters by two points."""
+
+
+@lru_cache(maxsize=1)
+def level_of_many(name: str) -> rec.SweepResult:
+    many = plot(name).looks(MANY, SEED, rec.SENSORS["VLP-16"])
+    return rec.judge(plot(name), many, detect(name, many, LEVEL))
+
+
 @pytest.mark.parametrize(
     ("height", "roll", "pitch", "less"),
     [
         (1.0, np.pi, 0.0, 0.03),
-        # The bar is 0.03 everywhere; level recall is 0.98, and the next three stay behind it by 6, 14 and 16 points.
-        (1.0, 0.0, np.radians(15), 0.07),
-        (1.0, -0.37, 0.37, 0.15),  # 30°: rings cross stems so obliquely that chains break
-        (0.3, 0.0, 0.0, 0.17),  # the understory hides more from there
+        (1.0, 0.0, np.radians(15), 0.03),
+        # The bar is 0.03 everywhere; level recall is 0.98, and these two stay behind it by 12 and 10 points. What is missed stands within
+        # 2.5 m, where so sparse a cloud gives 4 to 20 returns, full of holes, of a stem of which a sensor has hundreds.
+        (1.0, -0.37, 0.37, 0.15),
+        (0.3, 0.0, 0.0, 0.13),
         (2.5, 0.0, 0.0, 0.03),
     ],
 )
@@ -103,8 +114,8 @@ def test_any_mounting_finds_them(shared: Path, height: float, roll: float, pitch
     """Upside down, tilted, near the ground and high up: what is found is a stem, and of the stems shown most are found."""
     mount = from_xyz_rpy(0, 0, height, roll, pitch, 0)
     p = plot("pine_plot")
-    turned = p.looks(POSES, SEED, rec.SENSORS["VLP-16"], mount)
-    level = rec.judge(p, looks("pine_plot"), detect("pine_plot", looks("pine_plot"), LEVEL))
+    turned = p.looks(MANY, SEED, rec.SENSORS["VLP-16"], mount)
+    level = level_of_many("pine_plot")
     ours = rec.judge(p, turned, detect("pine_plot", turned, mount))
     assert ours.recall >= level.recall - less
     assert ours.precision >= 0.85

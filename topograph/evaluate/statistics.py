@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from topograph.geometry import Array
 
@@ -16,7 +16,7 @@ def wilson(wrong: int, n: int, level: float = 0.95) -> tuple[float, float]:
     """Interval of a share (Wilson 1927): right also where none of few went wrong, unlike the normal approximation."""
     if n == 0:
         return 0.0, 1.0
-    z = float(norm.ppf(0.5 + 0.5 * level))
+    z = float(ndtri(0.5 + 0.5 * level))
     p = wrong / n
     middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z / (1 + z**2 / n) * float(np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)))

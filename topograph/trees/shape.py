@@ -7,8 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betaln, expit, logit
-from scipy.stats import beta
+from scipy.special import betainc, betaln, expit, logit
 
 from topograph.geometry import Array, inverse, transform
 from topograph.trees.detections import Detections
@@ -314,7 +313,7 @@ def _forked_probability(told: Array) -> Array:
     (a, b), (c, e) = SHOWN_FORKED, SHOWN_SINGLE
     log_odds = betaln(k + a, n - k + b) - betaln(a, b) - betaln(k + c, n - k + e) + betaln(c, e)
     known = n >= LEAST_TOLD
-    surely = np.sum(k[known] > SURELY * n[known]) / beta.sf(SURELY, *SHOWN_FORKED)
+    surely = np.sum(k[known] > SURELY * n[known]) / (1.0 - betainc(*SHOWN_FORKED, SURELY))
     rate = min((USUAL_FORKS[0] + surely) / (sum(USUAL_FORKS) + known.sum()), 0.95)
     return np.asarray(np.where(n > 0, expit(log_odds + logit(rate)), 0.0))
 

@@ -81,12 +81,12 @@ class _Group(click.Group):
             ctx.exit(TopographError.exit_code)
 
 
-M_MMAP_THRESHOLD, M_ARENA_MAX = -3, -8
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
 """Of glibc's mallopt(3)."""
 
 
-LARGE = 1 << 20
-"""Bytes from which on an array has pages of its own."""
+LARGE, KEPT = 4 << 20, 32 << 20
+"""Bytes from which on an array has pages of its own; what stays with the heap when it is freed, for the next sweep."""
 
 
 def _thrifty() -> None:
@@ -97,6 +97,7 @@ def _thrifty() -> None:
         libc = ctypes.CDLL("libc.so.6")
         libc.mallopt(M_ARENA_MAX, 1)
         libc.mallopt(M_MMAP_THRESHOLD, LARGE)
+        libc.mallopt(M_TRIM_THRESHOLD, KEPT)
 
 
 @click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})

@@ -112,7 +112,7 @@ def doctor() -> None:
 
 @main.command()
 def warm() -> None:
-    """Compile ahead what the first run would compile: about a minute, once after an installation."""
+    """Compile ahead what the first run would compile: about 40 s, once after an installation."""
     import tempfile
     import time
 

@@ -160,6 +160,8 @@ class Live:
             leg = self._localizer.leg
         last = self._odom[-1][1] if self._odom else np.eye(4)
         self._odom.append((trunks.stamp_ns, last @ planar(float(leg.step[0]), float(leg.step[1]), float(leg.step[2]))))
+        if self.old is not None:  # a map that is given is not renewed on the way: nobody asks for earlier poses
+            del self._odom[:-1]
         report = None if self._localizer is None else self._localizer.report
         if report is not None and report.fix is not None:
             self._anchor = report.fix.map_T_robot, self._odom[-1][1]

@@ -133,7 +133,8 @@ def say_if_cold(quiet: bool = False) -> None:
     folder = Path(own) if own else Path(__file__).parent.parent / "trunks"
     if not quiet and not any(folder.rglob("fit.fit_chains*.nbi")):
         click.echo(
-            "the first run of an installation compiles for half a minute or more (`topograph warm` does it ahead)", err=True
+            "the first run of an installation compiles for half a minute or more (`topograph warm` does it ahead)",
+            err=True,
         )
 
 

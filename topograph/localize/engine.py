@@ -305,7 +305,7 @@ class Engine:
     def near(self, xy: Array, reach: float) -> NDArray[np.int64]:
         """Rows of mapped trees within `reach` of a place."""
         i = self.index
-        return np.asarray(within_kernel(xy, reach, i.xy, i.origin, i.bucket, i.buckets, i.start, i.member))
+        return np.asarray(within_kernel(xy, reach, i.xy, i.grid))
 
     def _suspect(
         self, f: Filter, z: Array, m2: Array, logdet: Array, match: NDArray[np.int64], found: NDArray[np.bool_],

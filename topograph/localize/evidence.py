@@ -108,14 +108,10 @@ def weigh(found: Found, marks: Landmarks, submap: Submap, index: MapIndex, confi
     if not len(found.pose) or n < 2:
         return nothing()
     scales, prior = np.array(c.scales), np.log(np.array(c.scale_prior) / np.sum(c.scale_prior))
-    arguments = (
-        marks.m, marks.cov, marks.tree, marks.other, marks.diameter, marks.diameter_var, marks.var, index.xy, index.var,
-        index.diameter, index.diameter_mean, index.diameter_sd, index.origin, index.cell, index.nearest, index.bucket,
-        index.buckets, index.start, index.member, submap.raster, submap.origin, c.felled, c.map_sigma**2,
-    )  # fmt: skip
     log, pose, tree, scale, alike = evidence_kernel(
-        found.pose, *arguments, index.trust, 2.0 * index.jitter**2, scales, prior
-    )
+        found.pose, marks.bundle, marks.cov, index.trees, index.grid, submap.raster, submap.origin, c.felled, c.map_sigma**2,
+        index.trust, 2.0 * index.jitter**2, scales, prior,
+    )  # fmt: skip
     order = np.argsort(-log)
     order = order[np.isfinite(log[order])]
     order = order[unlike_kernel(pose[order], marks.m.mean(0))]

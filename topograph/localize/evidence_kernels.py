@@ -39,10 +39,11 @@ def chance_kernel(raster, felled):
 
 
 @njit(cache=True, error_model="numpy")
-def match_kernel(
-    c, s, x, y, m, var, tree, other, dia, dia_var, xy, tvar, tdia, dmean, dsd, origin, cell, nearest, base, seen, so
-):
+def match_kernel(c, s, x, y, marks, trees, base, seen, so):
     """Mapped tree of each landmark under one placement; each tree once."""
+    m, var, tree, other, dia, dia_var = marks.m, marks.var, marks.tree, marks.other, marks.diameter, marks.diameter_var
+    xy, tvar, tdia, dmean, dsd = trees.xy, trees.var, trees.diameter, trees.diameter_mean, trees.diameter_sd
+    origin, cell, nearest = trees.origin, trees.cell, trees.nearest
     n = len(m)
     out = np.full(n, -1, np.int64)
     cost = np.zeros(n)
@@ -80,15 +81,17 @@ def match_kernel(
 
 
 @njit(cache=True, error_model="numpy")
-def evidence_kernel(
-    poses, m, P, tree, other, dia, dia_var, var, xy, tvar, tdia, dmean, dsd, origin, cell, nearest, bucket, buckets, start,
-    member, raster, so, felled, base, trust, wild, scales, prior,
-):  # fmt: skip
+def evidence_kernel(poses, marks, P, trees, grid, raster, so, felled, base, trust, wild, scales, prior):
+    """Of each placement (M, 3): log evidence (M,), the placement aligned (M, 3), mapped tree (M, n) of each landmark, noise scale (M,), and
+    the log evidence (M,) of an orchard of the same design. `P` (2n, 2n) is the landmarks' covariance; see evidence.py.
+    """
+    m, tree, other, dia, dia_var = marks.m, marks.tree, marks.other, marks.diameter, marks.diameter_var
+    xy, tvar, tdia, dmean, dsd = trees.xy, trees.var, trees.diameter, trees.diameter_mean, trees.diameter_sd
     n, M = len(m), len(poses)
     log = np.full(M, -np.inf)
     alike = np.full(M, -np.inf)
     out = poses.copy()
-    trees = np.full((M, n), -1, np.int64)
+    matched = np.full((M, n), -1, np.int64)
     scale = np.ones(M)
     seen = chance_kernel(raster, felled)
     centre = np.array([so[0] + 0.5 * raster.shape[0], so[1] + 0.5 * raster.shape[1]])
@@ -103,29 +106,7 @@ def evidence_kernel(
         ok = True
         for turn in range(3):
             c, s = np.cos(yaw), np.sin(yaw)
-            new = match_kernel(
-                c,
-                s,
-                x,
-                y,
-                m,
-                var,
-                tree,
-                other,
-                dia,
-                dia_var,
-                xy,
-                tvar,
-                tdia,
-                dmean,
-                dsd,
-                origin,
-                cell,
-                nearest,
-                base,
-                seen,
-                so,
-            )
+            new = match_kernel(c, s, x, y, marks, trees, base, seen, so)
             changed, k = False, 0
             for i in range(n):
                 changed = changed or new[i] != ids[i]
@@ -147,7 +128,7 @@ def evidence_kernel(
                 fixed += other[i]
             else:
                 fixed += tree[i] - diameter_kernel(dia[i], dia_var[i], tdia[ids[i]], dmean, dsd)
-        fixed += views_kernel(x, y, yaw, ids, xy, origin, bucket, buckets, start, member, seen, so, centre, reach)
+        fixed += views_kernel(x, y, yaw, ids, xy, grid, seen, so, centre, reach)
         top = -np.inf
         total = 0.0
         dof = 2 * k - 3
@@ -162,7 +143,7 @@ def evidence_kernel(
         log[h] = fixed + top + np.log(total)
         out[h, 0], out[h, 1], out[h, 2] = x, y, yaw
         for i in range(n):
-            trees[h, i] = ids[i]
+            matched[h, i] = ids[i]
         if log[h] > best:
             best = log[h]
         if log[h] > best - 6.0:
@@ -173,7 +154,7 @@ def evidence_kernel(
                     fixed - 0.5 * trust * qa - 0.5 * la - 0.5 * np.log(determinant3(La)) + (1.5 - k) * np.log(2 * np.pi)
                 )
                 alike[h] = np.logaddexp(alike[h], anew - np.log(len(scales)))
-    return log, out, trees, scale, alike
+    return log, out, matched, scale, alike
 
 
 @njit(cache=True, error_model="numpy")
@@ -235,8 +216,9 @@ def forward_kernel(C, B):
 
 
 @njit(cache=True, error_model="numpy")
-def views_kernel(x, y, yaw, ids, xy, origin, bucket, buckets, start, member, seen, so, centre, reach):
+def views_kernel(x, y, yaw, ids, xy, grid, seen, so, centre, reach):
     """Log chance of the mapped trees in view to have been seen or missed as they were."""
+    origin, bucket, buckets, start, member = grid.origin, grid.bucket, grid.buckets, grid.start, grid.member
     c, s = np.cos(yaw), np.sin(yaw)
     cx, cy = x + c * centre[0] - s * centre[1], y + s * centre[0] + c * centre[1]
     total = 0.0

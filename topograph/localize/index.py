@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from topograph.geometry import Array
-from topograph.localize.search_kernels import fill_kernel
+from topograph.localize.search_kernels import Grid, Trees, fill_kernel
 
 DIAMETER_NOISE = 0.02
 """Standard deviation of a mapped diameter, m: orchards whose diameters vary no more than this are all alike."""
@@ -56,6 +56,18 @@ class MapIndex:
 
     def __len__(self) -> int:
         return len(self.xy)
+
+    @property
+    def trees(self) -> Trees:
+        """What kernels take of the trees."""
+        return Trees(
+            self.xy, self.var, self.diameter, self.diameter_mean, self.diameter_sd, self.origin, self.cell, self.nearest
+        )
+
+    @property
+    def grid(self) -> Grid:
+        """What kernels take of the coarse cells."""
+        return Grid(self.origin, self.bucket, self.buckets, self.start, self.member)
 
     @property
     def bytes(self) -> int:

@@ -14,7 +14,7 @@ import numpy as np
 from topograph.geometry import Array
 from topograph.localize.config import LocalizeConfig
 from topograph.localize.index import MapIndex
-from topograph.localize.search_kernels import distinct_kernel, seed_kernel
+from topograph.localize.search_kernels import Marks, distinct_kernel, seed_kernel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +41,11 @@ class Landmarks:
 
     def __len__(self) -> int:
         return len(self.m)
+
+    @property
+    def bundle(self) -> Marks:
+        """What kernels take of them."""
+        return Marks(self.m, self.var, self.diameter, self.diameter_var, self.tree, self.other)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +95,7 @@ def searching(
     losses: list[Array] = []
     best, seeds, tried, missed = np.inf, 0, 0, 1.0
     order_all = np.argsort(marks.var - 0.02 * marks.lasting)
+    bundle = marks.bundle._replace(other=marks.other - marks.tree)
     alone = marks.tree - marks.other  # what a landmark costs that is no mapped tree
     typical = float(np.sum(np.maximum(alone - np.log(2 * np.pi * (marks.var + config.map_sigma**2)), 0.0)))
     for used, (i, j, p_both, low, high) in enumerate(pairs):
@@ -101,11 +107,7 @@ def searching(
             if len(a) > 5000:  # neighbours after each other: the raster's cells are still in the processor's cache
                 near = np.argsort(index.place[a], kind="stable")
                 a, b = a[near], b[near]
-            pose, loss, best = seed_kernel(
-                marks.m, marks.var, marks.diameter, marks.diameter_var, marks.other - marks.tree, order,
-                a, b, index.xy, index.var, index.diameter, index.diameter_mean,
-                index.diameter_sd, index.origin, index.cell, index.nearest, best, config.bound, config.map_sigma,
-            )  # fmt: skip
+            pose, loss, best = seed_kernel(bundle, order, a, b, index.trees, best, config.bound, config.map_sigma)
             poses.append(pose)
             losses.append(loss)
             tried += len(a)

@@ -2,8 +2,47 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
+
+from topograph.geometry import Array
+
+
+class Marks(NamedTuple):
+    """Landmarks as kernels take them: see `search.Landmarks`; each (n,), `m` (n, 2)."""
+
+    m: Array
+    var: Array
+    diameter: Array
+    diameter_var: Array
+    tree: Array
+    other: Array
+
+
+class Trees(NamedTuple):
+    """The map's trees and the raster that finds the nearest: see `index.MapIndex`."""
+
+    xy: Array
+    var: Array
+    diameter: Array
+    diameter_mean: float
+    diameter_sd: float
+    origin: Array
+    cell: float
+    nearest: NDArray[np.int32]
+
+
+class Grid(NamedTuple):
+    """Coarse cells and the trees in them: see `index.MapIndex`."""
+
+    origin: Array
+    bucket: float
+    buckets: NDArray[np.int64]
+    start: NDArray[np.int32]
+    member: NDArray[np.int32]
 
 
 @njit(cache=True, error_model="numpy")
@@ -23,27 +62,13 @@ def fill_kernel(nearest, xy, low, cell, reach):
 
 
 @njit(cache=True, error_model="numpy", fastmath=True)
-def seed_kernel(
-    m,
-    var,
-    dia,
-    dia_var,
-    other,
-    order,
-    pa,
-    pb,
-    xy,
-    tvar,
-    tdia,
-    dmean,
-    dsd,
-    origin,
-    cell,
-    nearest,
-    best,
-    bound,
-    map_sigma,
-):
+def seed_kernel(marks, order, pa, pb, trees, best, bound, map_sigma):
+    """Placements (K, 3) by the pairs of trees `pa`, `pb` as far apart as the first two landmarks in `order`, their losses (K,), and the
+    best loss so far; dropped when `bound` behind it. `marks.other` is what a landmark costs that is no mapped tree.
+    """
+    m, var, other, dia, dia_var = marks.m, marks.var, marks.other, marks.diameter, marks.diameter_var
+    xy, tvar, tdia, dmean, dsd = trees.xy, trees.var, trees.diameter, trees.diameter_mean, trees.diameter_sd
+    origin, cell, nearest = trees.origin, trees.cell, trees.nearest
     n = len(m)
     out = np.empty((1024, 3))
     losses = np.empty(1024)
@@ -183,7 +208,9 @@ def distinct_kernel(pose, loss, centre, most):
 
 
 @njit(cache=True, error_model="numpy")
-def within_kernel(at, reach, xy, origin, bucket, buckets, start, member):
+def within_kernel(at, reach, xy, grid):
+    """Rows (K,) of the trees `xy` (T, 2) within `reach` m of a place (2,)."""
+    origin, bucket, buckets, start, member = grid.origin, grid.bucket, grid.buckets, grid.start, grid.member
     out = np.empty(64, np.int64)
     n = 0
     x0, x1 = (

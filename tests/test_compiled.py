@@ -1,7 +1,7 @@
 """Numerics for compiled kernels are numpy's."""
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -10,6 +10,7 @@ from topograph.compiled import determinant3, quantile, solve3
 finite = st.floats(-1e3, 1e3)
 
 
+@settings(deadline=None)  # the first call may compile
 @given(arrays(float, st.integers(1, 40), elements=finite), st.floats(0.0, 1.0))
 def test_quantile(values, share):
     kept = values.copy()
@@ -17,6 +18,7 @@ def test_quantile(values, share):
     np.testing.assert_array_equal(values, kept)
 
 
+@settings(deadline=None)
 @given(arrays(float, (3, 3), elements=st.floats(-3, 3)), arrays(float, 3, elements=finite))
 def test_solution_and_determinant(root, b):
     A = root @ root.T + 0.1 * np.eye(3)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from topograph.bags import Imu, Odometry, Trunks
 from topograph.session import SECTORS, Scans, ScansBuilder, StreamsBuilder
-from topograph.session.scans import LOT
+from topograph.session.scans import SCANS_AT_ONCE
 from topograph.trees import Detections
 
 FIELDS = ("p", "axis", "diameter", "cov", "height", "score", "kinds", "measured", "stems", "free", "eye")
@@ -41,9 +41,8 @@ def drawn(seed: int, stamp_ns: int) -> Trunks:
 def same(a: Trunks, b: Trunks) -> None:
     """Every field, to the bit."""
     assert (a.stamp_ns, a.frame, len(a)) == (b.stamp_ns, b.frame, len(b))
-    if len(a):  # of no trunks, none is on its surface and none has a cloud
-        assert a.surface == b.surface
-        assert len(a.clouds) == len(b.clouds)
+    assert a.surface == b.surface
+    assert len(a.clouds) == len(b.clouds)
     for k in FIELDS:
         np.testing.assert_array_equal(getattr(a, k), getattr(b, k), err_msg=k)
     for u, v in zip(a.clouds, b.clouds, strict=True):
@@ -61,20 +60,40 @@ def test_scans_come_out_as_they_went_in(stamps: list[int], seed: int) -> None:
         same(a, b)
     ordered = sorted(trunks, key=lambda t: t.stamp_ns)
     once = [t for i, t in enumerate(ordered) if i == 0 or t.stamp_ns > ordered[i - 1].stamp_ns]
-    for a, b in zip(scans.in_order, once, strict=True):
+    for a, b in zip(scans.in_order(), once, strict=True):
         same(a, b)
     d = Detections.of(trunks)
     assert d.stamps_ns.tolist() == [t.stamp_ns for t in once]
-    np.testing.assert_array_equal(d.p, np.concatenate([np.zeros((0, 3)), *[t.p for t in once]]))
     np.testing.assert_array_equal(np.bincount(d.scan, minlength=len(once)), [len(t) for t in once])
+    for name, shape, missing in (
+        ("p", (3,), 0.0), ("cov", (3, 3), 0.0), ("axis", (3,), 0.0), ("height", (), 0.0), ("diameter", (), 0.0), ("score", (), 0.0),
+        ("kinds", (3,), np.nan), ("measured", (6,), 0.0), ("stems", (), 1.0),
+    ):  # fmt: skip
+        told = [
+            getattr(t, name) if len(getattr(t, name)) == len(t) else np.full((len(t), *shape), missing) for t in once
+        ]
+        np.testing.assert_array_equal(getattr(d, name), np.concatenate([np.zeros((0, *shape)), *told]), err_msg=name)
+    if len(d.free):
+        free = [t.free if len(t.free) else np.zeros(SECTORS, np.uint32) for t in once]
+        np.testing.assert_array_equal(d.free, free)
+
+
+def test_lots_of_which_only_one_tells_what_it_saw_through() -> None:
+    dumb, telling = (
+        [t for t in (drawn(k, k) for k in range(60)) if (len(t.free) > 0) == told][:5] for told in (False, True)
+    )
+    for parts in ((dumb, telling), (telling, dumb), (dumb, dumb)):
+        for a, b in zip(Scans.joined([Scans.of(p) for p in parts]), [*parts[0], *parts[1]], strict=True):
+            same(a, b)
 
 
 def test_more_may_come_after_building() -> None:
-    builder, trunks = ScansBuilder(), [drawn(k, k) for k in range(2 * LOT + 7)]
-    builder.extend(trunks[: LOT + 3])
+    some = SCANS_AT_ONCE + 3
+    builder, trunks = ScansBuilder(), [drawn(k, k) for k in range(2 * SCANS_AT_ONCE + 7)]
+    builder.extend(trunks[:some])
     first = builder.build()
-    builder.extend(trunks[LOT + 3 :])
-    assert (len(first), len(builder), builder.last_ns) == (LOT + 3, len(trunks), trunks[-1].stamp_ns)
+    builder.extend(trunks[some:])
+    assert (len(first), len(builder), builder.last_ns) == (some, len(trunks), trunks[-1].stamp_ns)
     for a, b in zip(builder.build(), trunks, strict=True):
         same(a, b)
 

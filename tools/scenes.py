@@ -71,7 +71,7 @@ def sensor_of(rng: np.random.Generator) -> SensorConfig:
 
 
 HARD_FROM, HARD = 900, ("hedgerow", "trellis", "young", "old_olive", "steep")
-"""Training seeds from which on only the designs are drawn in which single sweeps err most."""
+"""Training seeds from which on, below `ODD_FROM`, only the designs are drawn in which single sweeps err most."""
 
 
 ODD_FROM = 1200

@@ -4,8 +4,8 @@
     python tools/soak.py --map MAP.gpkg --run RUN.bag [--hours 8]
 
 Without a map, the graph of one hypothesis (localize/hypothesis.py) is fed the sightings of a robot that drives in circles. With one, the
-localizer is fed a recorded run over and over: at each repetition the robot is carried back to where the run begins, and must be lost
-and found again. Simulated hours pass as fast as they can be computed; memory, error and time of an update are printed every half hour.
+localizer is fed a recorded run over and over: at each repetition the robot is carried back to where the run begins, and must be found
+there (take a run that ends elsewhere). Simulated hours pass as fast as they can be computed; memory, error and time of an update are printed every half hour.
 """
 
 from __future__ import annotations
@@ -85,16 +85,16 @@ def over_and_over(map_file: Path, bag: Path, hours: float) -> None:
             ms.append(1e3 * (time.perf_counter() - began))
             waiting = []
             states[localizer.report.state if localizer.report is not None else "none"] += 1
-            if fix is not None:  # the first lap's poses are the reference of the others
+            if fix is not None:  # the first is the reference of the others
                 first.setdefault(message.stamp_ns, []).append(fix.map_T_robot[:2, 3])
         shift += lap_ns
         lap += 1
-        if shift - told_ns >= HALF_HOUR_S * 1e9:
+        if shift - told_ns >= HALF_HOUR_S * 1e9 or shift >= hours * 3600e9:
             told_ns = shift
-            apart = [np.hypot(*(p[-1] - p[0])) for p in first.values() if len(p) > 1]
+            apart = [np.hypot(*(q - p[0])) for p in first.values() for q in p[1:]]
             share = states["tracking"] / max(states.total(), 1)
             print(f"{shift / 3600e9:4.1f} h  {resident_mb():6.0f} MB  lap {lap}, tracking {100 * share:.1f} % of the scans, "
-                  f"poses apart from the first lap's {100 * np.median(apart or [np.nan]):.1f} cm, at most {100 * max(apart, default=np.nan):.1f}  "
+                  f"poses apart from the first of each scan {100 * np.median(apart or [np.nan]):.1f} cm, at most {100 * max(apart, default=np.nan):.1f}  "
                   f"update {np.median(ms):.2f} ms, 99 % {np.percentile(ms, 99):.2f}", flush=True)  # fmt: skip
             first = {k: p[:1] for k, p in first.items()}
             states, ms = Counter(), []

@@ -1,4 +1,4 @@
-"""The commands: words -> pipeline -> report."""
+"""`topograph detect`, `simulate`, `demo`, `repair`, `export` and `config`."""
 
 from __future__ import annotations
 

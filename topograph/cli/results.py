@@ -185,9 +185,10 @@ def _pictures(folder: Path, topo: Any, title: str, verdict: Any, figures: dict[s
     from topograph.report.viewer import write_viewer
 
     for name, file in ((MAP, "map.png"), (BY_FACTOR, "residuals.png")):
-        (folder / file).unlink(missing_ok=True)
         if name in figures:
             (folder / file).write_bytes(figures[name])
+        else:
+            (folder / file).unlink(missing_ok=True)
     if len(topo):
         said = [f"{verdict.word}: {r}" for r in verdict.reasons]
         write_viewer(folder / "map.html", topo, title, notes=said[:1])

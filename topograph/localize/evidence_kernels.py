@@ -50,8 +50,8 @@ def match_kernel(c, s, x, y, marks, trees, base, seen, so):
     for k in range(n):
         px, py = x + c * m[k, 0] - s * m[k, 1], y + s * m[k, 0] + c * m[k, 1]
         gx, gy = int((px - origin[0]) / cell), int((py - origin[1]) / cell)
-        if px <= origin[0] or py <= origin[1] or gx >= nearest.shape[0] or gy >= nearest.shape[1]:
-            continue
+        if not (px > origin[0] and py > origin[1]) or gx >= nearest.shape[0] or gy >= nearest.shape[1]:
+            continue  # outside, or no number
         t = nearest[gx, gy]
         if t < 0:
             continue
@@ -120,7 +120,7 @@ def evidence_kernel(poses, marks, P, trees, grid, raster, so, felled, base, trus
                 ok = False
                 break
             x, y, yaw, q, logdet, L = align_kernel(rows[:k], ids, m, P, xy, tvar, base, 0.0, 1.0, x, y, yaw)
-        if not ok:
+        if not ok or not np.isfinite(yaw):  # two trees at one place fix no heading
             continue
         fixed = 0.0
         for i in range(n):

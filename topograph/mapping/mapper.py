@@ -111,7 +111,8 @@ class Mapper:
         )
 
     def begin(self) -> None:
-        """A solve of what came so far begins, here or elsewhere."""
+        """A solve of what came so far, which is something, begins, here or elsewhere."""
+        assert len(self._trunks)
         self._solved_ns = self._trunks.last_ns
 
     def solve(self) -> Solved | None:

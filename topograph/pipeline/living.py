@@ -245,7 +245,7 @@ class _Solving:
     """A solve beside the driving: a child of this process, which has all that came until now, and whose map comes back."""
 
     def __init__(self, mapper: Mapper, config: Config) -> None:
-        context = get_context("fork")  # the child needs all that came: nothing of it is copied or sent
+        context = get_context("fork")  # the child needs all that came: nothing of it is sent
         self._result, mine = context.Pipe(duplex=False)
         self._process = context.Process(target=self._work, args=(mine, mapper, config), daemon=True)
         self._process.start()

@@ -71,7 +71,7 @@ def topo_map(solved: Solved, config: Config, meta: dict[str, str], *, clouds: bo
     return build(
         solved.estimate,
         solved.detections,
-        solved.run.trunks.in_order if clouds else None,
+        solved.run.trunks.in_order() if clouds else None,
         map_T_scans(solved),
         solved.existence,
         solved.shapes,
@@ -123,7 +123,7 @@ def averaged(
     topo = build(
         e,
         d,
-        run.trunks.in_order if clouds else None,
+        run.trunks.in_order() if clouds else None,
         poses,
         all_trees,
         shapes(d, e.tree, poses, n),

@@ -103,7 +103,12 @@ class Heard:
 def hear(paths: Sequence[Path], config: Config, progress: Progress = silent) -> Heard:
     """Read and detect a run once, to be mapped and localized in many ways. Raises as `read_run`."""
     messages: list[Trunks | Imu | Odometry] = []
-    return Heard(read_run(paths, config, progress, keep=messages), messages)
+    session = read_run(paths, config, progress, keep=messages)
+    scans = iter(session.trunks)  # in the order of the stream: the same trunks on the columns' memory
+    for k, m in enumerate(messages):
+        if isinstance(m, Trunks):
+            messages[k] = next(scans)
+    return Heard(session, messages)
 
 
 def read_run(

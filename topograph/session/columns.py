@@ -9,7 +9,7 @@ import numpy as np
 from topograph.geometry import Array, Stamps
 
 
-class Stream:
+class Column:
     """Stamps and values of one stream, in the order of their coming.
 
     Attributes:
@@ -18,6 +18,7 @@ class Stream:
     """
 
     def __init__(self, width: int) -> None:
+        """Of messages of `width` values."""
         self._width = width
         self._ns, self._values = array("q"), array("d")
         self._earliest_ns = 0
@@ -28,7 +29,8 @@ class Stream:
         return len(self._ns)
 
     def add(self, stamp_ns: int, frame: str, *values: Array) -> None:
-        """One message, of `width` values."""
+        """One message."""
+        assert sum(v.size for v in values) == self._width
         if not self._ns or stamp_ns < self._earliest_ns:
             self._earliest_ns, self.frame = stamp_ns, frame
         self.last_ns = stamp_ns

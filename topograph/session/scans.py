@@ -99,9 +99,8 @@ class Scans(Sequence[Trunks]):
         """Points (M, 3) of one trunk."""
         return self.points[self.cloud_ends[row] : self.cloud_ends[row + 1]]
 
-    @property
     def in_order(self) -> Scans:
-        """The scans in the order of time, each stamp once."""
+        """The scans in the order of time, each stamp once: themselves, where they are so already."""
         if (np.diff(self.stamps_ns) > 0).all():
             return self
         order = np.argsort(self.stamps_ns, kind="stable")
@@ -160,7 +159,7 @@ def _all(parts: Iterable[NDArray[Any]]) -> NDArray[Any]:
     return np.concatenate(list(parts))
 
 
-LOT = 512
+SCANS_AT_ONCE = 512
 """Scans that are kept as they came, until they are put into columns together."""
 
 
@@ -179,7 +178,7 @@ class ScansBuilder:
         """One scan."""
         self._new.append(trunks)
         self.last_ns = trunks.stamp_ns
-        if len(self._new) == LOT:
+        if len(self._new) == SCANS_AT_ONCE:
             self._lots.append(_columns(self._new))
             self._new = []
 

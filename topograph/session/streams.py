@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from topograph.bags import Fix, Heading, Imu, Odometry
 from topograph.geometry import Array, Datum, Stamps, from_quaternion
-from topograph.session.columns import Stream
+from topograph.session.columns import Column
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,7 +86,7 @@ class StreamsBuilder:
     """Collects messages as they come: the many in columns, the few as they are."""
 
     def __init__(self) -> None:
-        self.odometry, self.imu = Stream(13), Stream(6)
+        self.odometry, self.imu = Column(13), Column(6)
         self.fixes: list[Fix] = []
         self.headings: list[Heading] = []
         self.unsound: Counter[str] = Counter()
@@ -108,9 +108,9 @@ class StreamsBuilder:
     def build(self, skipped: Counter[str]) -> Streams:
         """Arrays in time order; repeated stamps and unusable fixes are dropped and counted."""
         skipped.update(self.unsound)
-        odometry_ns, moved, again = self.odometry.in_order()
-        imu_ns, felt, shaken = self.imu.in_order()
-        skipped.update({f"{k}: {REPEATED}": n for k, n in (("odometry", again), ("imu", shaken)) if n})
+        odometry_ns, moved, odometry_again = self.odometry.in_order()
+        imu_ns, felt, imu_again = self.imu.in_order()
+        skipped.update({f"{k}: {REPEATED}": n for k, n in (("odometry", odometry_again), ("imu", imu_again)) if n})
         fixes = _moving([f for f in map(_flat, _in_order(self.fixes, "fix", skipped)) if _usable(f, skipped)], skipped)
         headings = _in_order(self.headings, "heading", skipped)
         frames = {name: stream.frame for name, stream in (("child", self.odometry), ("imu", self.imu)) if len(stream)}

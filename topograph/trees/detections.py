@@ -61,7 +61,7 @@ class Detections:
     @staticmethod
     def of(trunks: Iterable[Trunks]) -> Detections:
         """Trunks given scan by scan, already in `base_link`; on the same memory, where they come in columns and in order."""
-        s = Scans.of(trunks).in_order
+        s = Scans.of(trunks).in_order()
         rows = ("p", "cov", "axis", "height", "diameter", "score", "kinds", "measured", "stems")
         return Detections(
             stamps_ns=s.stamps_ns,

@@ -14,7 +14,7 @@ from topograph.trees.detections import Detections
 from topograph.trees.robust import weighted_median
 from topograph.trees.screen import parts_apart
 from topograph.trees.tracks import TreesConfig
-from topograph.trunks.score import KIND_PRIOR, OTHER, TREE, column_odds
+from topograph.trunks.score import KIND_PRIOR, KINDS, OTHER, TREE, column_odds
 
 FRESH = 0.25
 """Share of what a further sighting of the same tree says that the ones before have not said."""
@@ -206,14 +206,14 @@ def _kinds(d: Detections, tree: NDArray[np.int64], n: int) -> tuple[NDArray[np.i
     chance = np.exp(z) / np.exp(z).sum(axis=1, keepdims=True)
     kind = chance.argmax(axis=1)
     kind[total == 0] = TREE
-    probability = (1.0 - ALIKE) * chance[np.arange(n), kind] + ALIKE / 3.0
+    probability = (1.0 - DECEIVED) * chance[np.arange(n), kind] + DECEIVED / len(KINDS)
     probability[total == 0] = np.nan
     return kind, probability
 
 
-ALIKE = 0.03
-"""Chance that a thing looks like another kind from every side: however often it is seen, no more is known. Of simulated nodes that are called
-trees one in a hundred is none; of those in a recorded street (masts, pillars) half.
+DECEIVED = 0.03
+"""Chance that looks tell nothing of a kind, from whatever side and however often: no kind is surer than 0.98. Of simulated nodes that are
+called trees one in a hundred is none; of those in a recorded street (masts, pillars) six in ten.
 """
 LOOK = 0.2
 """Between two looks at the same place, m: what rides along stands still beside a robot that stands, however long it does."""

@@ -80,22 +80,24 @@ def parts_apart(
     place: Array, d: Detections, label: NDArray[np.int64], n: int, drift: Array, sway: float
 ) -> NDArray[np.bool_]:
     """Labels (n,) of whose sightings at `place` (N, 2) two parts in time lie further apart than `sway`, their noise and the
-    difference of `drift` (N,) between them, m.
+    difference of `drift` (N,) between them, m. A sighting whose `label` (N,) is negative is of none.
     """
     order = np.lexsort((d.scan, label))
-    ends = np.searchsorted(label[order], np.arange(n + 1))
+    order = order[label[order] >= 0]
+    label = label[order]
+    ends = np.searchsorted(label, np.arange(n + 1))
     count = np.diff(ends)
     long = np.flatnonzero(count >= GROUPS)
     rank = np.arange(len(order)) - np.repeat(ends[:-1], count)  # of a sighting in its label, in time
     size, more = np.repeat(count // GROUPS, count), np.repeat(count % GROUPS, count)  # the first parts have one more
-    part = np.empty(len(order), np.int64)
-    part[order] = np.where(
+    part = np.where(
         rank < more * (size + 1), rank // (size + 1), more + (rank - more * (size + 1)) // np.maximum(size, 1)
     )
     group = label * GROUPS + part
+    place, spread = place[order], np.sqrt(0.5 * (d.cov[order, 0, 0] + d.cov[order, 1, 1]))
     middle = np.stack([_medians(place[:, k], group, n * GROUPS) for k in range(2)], axis=1).reshape(n, GROUPS, 2)
-    way = _medians(drift, group, n * GROUPS).reshape(n, GROUPS)
-    sigma = _medians(np.sqrt(0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1])), label, n)[long]
+    way = _medians(drift[order], group, n * GROUPS).reshape(n, GROUPS)
+    sigma = _medians(spread, label, n)[long]
     noise = np.minimum(3.0 * sigma / np.sqrt(count[long] / GROUPS), NOISE)
     out = np.zeros(n, bool)
     for i, j in combinations(range(GROUPS), 2):
@@ -105,11 +107,13 @@ def parts_apart(
 
 
 def _medians(values: Array, label: NDArray[np.int64], n: int) -> Array:
-    """Median (n,) of the values (N,) of each label; NaN where there is none."""
-    v = values[np.lexsort((values, label))]
+    """Median (n,) of the values (N,) of each label; NaN where there is none, or one of them is NaN."""
+    v = values[np.lexsort((values, label))]  # NaN last
     count = np.bincount(label, minlength=n)
     begin = np.cumsum(count) - count
     out = np.full(n, np.nan)
     some = np.flatnonzero(count)
-    out[some] = 0.5 * (v[begin[some] + (count[some] - 1) // 2] + v[begin[some] + count[some] // 2])
+    last = v[begin[some] + count[some] - 1]
+    middle = 0.5 * (v[begin[some] + (count[some] - 1) // 2] + v[begin[some] + count[some] // 2])
+    out[some] = np.where(np.isnan(last), np.nan, middle)
     return out

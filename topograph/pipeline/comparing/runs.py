@@ -58,7 +58,7 @@ def fixes_truth(heard: Heard, config: Config) -> Truth | None:
     p = prepare(heard.session, mapping_config(config)).problem
     if p.datum is None:
         return None
-    ns = np.unique(np.concatenate([[t.stamp_ns for t in heard.session.trunks], p.stamps_ns])).astype(np.int64)
+    ns = np.unique(np.concatenate([heard.session.trunks.stamps_ns, p.stamps_ns])).astype(np.int64)
     ns = ns[(ns >= p.stamps_ns[0]) & (ns <= p.stamps_ns[-1])]
     sigma = float(np.sqrt(np.median(p.fixes.cov[:, 0, 0])))
     return Truth.of_path(ns, filtered_path(p, ns), p.datum, sigma)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, overload
+from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,24 +124,31 @@ class Scans(Sequence[Trunks]):
         )
 
     @staticmethod
-    def joined(parts: Sequence[Scans]) -> Scans:
-        """One after the other."""
+    def joined(parts: list[Scans]) -> Scans:
+        """One after the other. The list is emptied on the way, so that memory never holds all of them twice."""
         if len(parts) == 1:
-            return parts[0]
+            return parts.pop()
+        scans, rows, points = (sum(q) for q in zip(*((len(q), len(q.p), len(q.points)) for q in parts), strict=True))
         told = any(len(q.free) for q in parts)
-        return Scans(
-            stamps_ns=_all(q.stamps_ns for q in parts),
-            frames=tuple(f for q in parts for f in q.frames),
-            ends=_sum(_all(np.diff(q.ends) for q in parts)),
-            free=_all(q.free if len(q.free) or not told else np.zeros((len(q), SECTORS), np.uint32) for q in parts),
-            eye=_all(q.eye for q in parts),
-            points=_all(q.points for q in parts),
-            cloud_ends=_sum(_all(np.diff(q.cloud_ends) for q in parts)),
-            given=_all(q.given for q in parts),
-            **{k: _all(getattr(q, k) for q in parts) for k in _ROWS},
-        )
+        length = {"points": points, "free": scans * told, **dict.fromkeys(_SCANS, scans), **dict.fromkeys(_ROWS, rows)}
+        whole = {k: np.zeros((n, *(v := getattr(parts[0], k)).shape[1:]), v.dtype) for k, n in length.items()}
+        at = dict.fromkeys(length, 0)
+        frames: list[str] = []
+        count, size = [], []
+        while parts:
+            q = parts.pop(0)
+            for k in length:
+                v = getattr(q, k)
+                whole[k][at[k] : at[k] + len(v)] = v
+                at[k] += len(q) * told if k == "free" else len(v)  # zeros where a part tells nothing
+            frames += q.frames
+            count.append(np.diff(q.ends))
+            size.append(np.diff(q.cloud_ends))
+        ends, cloud_ends = _sum(np.concatenate(count)), _sum(np.concatenate(size))
+        return Scans(frames=tuple(frames), ends=ends, cloud_ends=cloud_ends, **whole)
 
 
+_SCANS = ("stamps_ns", "eye", "given")
 _ROWS = ("p", "axis", "diameter", "cov", "height", "score", "kinds", "measured", "stems")
 
 
@@ -153,10 +160,6 @@ def _sum(count: NDArray[np.int64]) -> NDArray[np.int64]:
 def _ranges(start: NDArray[np.int64], count: NDArray[np.int64]) -> NDArray[np.int64]:
     """Rows of ranges, one after the other."""
     return np.asarray(np.arange(count.sum()) + np.repeat(start - _sum(count)[:-1], count), np.int64)
-
-
-def _all(parts: Iterable[NDArray[Any]]) -> NDArray[Any]:
-    return np.concatenate(list(parts))
 
 
 SCANS_AT_ONCE = 512

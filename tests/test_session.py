@@ -83,7 +83,9 @@ def test_lots_of_which_only_one_tells_what_it_saw_through() -> None:
         [t for t in (drawn(k, k) for k in range(60)) if (len(t.free) > 0) == told][:5] for told in (False, True)
     )
     for parts in ((dumb, telling), (telling, dumb), (dumb, dumb)):
-        for a, b in zip(Scans.joined([Scans.of(p) for p in parts]), [*parts[0], *parts[1]], strict=True):
+        joined = Scans.joined([Scans.of(p) for p in parts])
+        assert len(joined.free) == (len(joined) if parts != (dumb, dumb) else 0)
+        for a, b in zip(joined, [*parts[0], *parts[1]], strict=True):
             same(a, b)
 
 

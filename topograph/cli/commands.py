@@ -16,6 +16,7 @@ from topograph.cli.common import (
     config_of,
     hashed,
     input_options,
+    jobs_option,
     main,
     peak_mb,
     progress_bar,
@@ -39,13 +40,7 @@ from topograph.errors import InputError, MapError, UsageError
 )
 @click.option("--truth", multiple=True, type=click.Path(path_type=Path), help=TRUTH)
 @click.option("--results", type=click.Path(path_type=Path), help="Folder for report.json.")
-@click.option(
-    "--jobs",
-    type=click.IntRange(1),
-    default=1,
-    show_default=True,
-    help="Processes that detect; the result is the same.",
-)
+@jobs_option
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 @input_options
 def detect(
@@ -76,7 +71,7 @@ def detect(
     if run.scans == 0:
         raise InputError("no point cloud and no trunk detections; name a topic with --topic-points or --topic-trunks")
     # What a single scan doubts is for the map to decide; here it would only be a false trunk.
-    trunks = [t.select(t.score >= 0) for t in sorted(run.trunks, key=lambda t: t.stamp_ns)]
+    trunks = [t.select(t.score >= 0) for t in run.trunks.in_order()]
     n = sum(map(len, trunks))
     click.echo(
         f"{run.scans} scans, {n} trunks ({n / run.scans:.1f} a scan), {run.seconds:.1f} s, {run.duration_s / run.seconds:.1f} × real time"

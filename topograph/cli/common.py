@@ -138,6 +138,23 @@ def say_if_cold(quiet: bool = False) -> None:
         )
 
 
+jobs_option = click.option(
+    "--jobs",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Processes that detect; the result is the same.",
+)
+
+
+def span_options(f: _F) -> _F:
+    """--from and --to: the part of a recording that is read."""
+    f = click.option("--to", "to_s", type=float, default=float("inf"), help="End there.")(f)
+    return click.option("--from", "from_s", type=float, default=0.0, help="Begin so many seconds into the recording.")(
+        f
+    )
+
+
 def input_options(f: _F) -> _F:
     for kind in reversed(_TOPICS):
         f = click.option(f"--topic-{kind}", default=None, metavar="TOPIC", help=f"Topic of {kind}; 'none' ignores it.")(

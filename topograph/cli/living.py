@@ -24,6 +24,7 @@ from topograph.cli.common import (
     progress_bar,
     results_folder,
     say_if_cold,
+    span_options,
     table,
     truth_of,
 )
@@ -42,8 +43,7 @@ from topograph.errors import InputError, TopographError, UsageError
 @click.option("--every", type=click.FloatRange(0.0), default=1.0, show_default=True,
               help="Say what is known every so many seconds of the recording.")  # fmt: skip
 @click.option("--accept", multiple=True, metavar="NAME", help="Save the map though the audit refuses it for NAME.")
-@click.option("--from", "from_s", type=float, default=0.0, help="Begin so many seconds into the recording.")
-@click.option("--to", "to_s", type=float, default=float("inf"), help="End there.")
+@span_options
 @click.option("--results", type=click.Path(path_type=Path), help="Folder for path, report and configuration.")
 @click.option("--truth", multiple=True, type=click.Path(path_type=Path), help=TRUTH)
 @click.option("-q", "--quiet", is_flag=True, help="Say nothing on the way.")

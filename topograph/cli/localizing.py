@@ -23,6 +23,7 @@ from topograph.cli.common import (
     results_folder,
     say_if_cold,
     span_facts,
+    span_options,
     table,
     truth_of,
     versions,
@@ -40,8 +41,7 @@ from topograph.errors import UsageError
 )
 @click.option("--measure", type=click.Choice(["both", "ranges", "bearings"]), default=None,
               help="What the graph takes of a trunk while tracking: bearing and range (both), or one of them; the thesis has ranges.")  # fmt: skip
-@click.option("--from", "from_s", type=float, default=0.0, help="Begin so many seconds into the recording.")
-@click.option("--to", "to_s", type=float, default=float("inf"), help="End there.")
+@span_options
 @click.option("--results", type=click.Path(path_type=Path), help="Folder for poses, table, report and configuration.")
 @click.option("--truth", multiple=True, type=click.Path(path_type=Path), help=TRUTH)
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")

@@ -15,10 +15,12 @@ from topograph.cli.common import (
     config_of,
     hashed,
     input_options,
+    jobs_option,
     main,
     progress_bar,
     results_folder,
     say_if_cold,
+    span_options,
     truth_of,
 )
 from topograph.cli.results import save_results, save_thesis, say_verdict
@@ -42,15 +44,8 @@ from topograph.errors import MapError, UsageError
 @click.option("--truth", multiple=True, type=click.Path(path_type=Path), help=TRUTH)
 @click.option("--check-fixes", type=click.IntRange(0), default=0, metavar="N",
               help="Withhold every N-th fix from the estimator and report the path's distance from it (1: withhold all).")  # fmt: skip
-@click.option("--from", "from_s", type=float, default=0.0, help="Begin so many seconds into the recording.")
-@click.option("--to", "to_s", type=float, default=float("inf"), help="End there.")
-@click.option(
-    "--jobs",
-    type=click.IntRange(1),
-    default=1,
-    show_default=True,
-    help="Processes that detect; the result is the same.",
-)
+@span_options
+@jobs_option
 @click.option("-q", "--quiet", is_flag=True, help="No progress.")
 @input_options
 def map_command(

@@ -1,11 +1,12 @@
 """One run: what it is called, its mountings, its streams as columns. The only thing the rooms above are handed."""
 
 from topograph.session.journal import Journal, Journaled
-from topograph.session.scans import SECTORS, Scans, ScansBuilder
+from topograph.session.scans import ROWS, SECTORS, Scans, ScansBuilder
 from topograph.session.session import Session, unknown_mounts
 from topograph.session.streams import Streams, StreamsBuilder
 
 __all__ = [
+    "ROWS",
     "SECTORS",
     "Journal",
     "Journaled",

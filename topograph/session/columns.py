@@ -5,8 +5,15 @@ from __future__ import annotations
 from array import array
 
 import numpy as np
+from numpy.typing import NDArray
 
 from topograph.geometry import Array, Stamps
+
+
+def rising(stamps_ns: Stamps) -> NDArray[np.int64]:
+    """Rows (K,) of stamps (N,) in the order of time, each stamp once: the first that came."""
+    order = np.argsort(stamps_ns, kind="stable")
+    return order[np.diff(stamps_ns[order], prepend=-(2**62)) > 0]
 
 
 class Column:
@@ -42,6 +49,5 @@ class Column:
         """Stamps (N,), rising, values (N, width), and how many messages were dropped since they repeat a stamp."""
         # Copies: a column that is looked at cannot grow.
         ns, values = np.array(self._ns, np.int64), np.array(self._values, float).reshape(-1, self._width)
-        order = np.argsort(ns, kind="stable")
-        order = order[np.diff(ns[order], prepend=-(2**62)) > 0]
-        return ns[order], values[order], len(ns) - len(order)
+        rows = rising(ns)
+        return ns[rows], values[rows], len(ns) - len(rows)

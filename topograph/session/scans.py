@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from topograph.bags import Trunks
 from topograph.geometry import Array, Stamps
+from topograph.session.columns import rising
 
 SECTORS = 360
 """Words of a scan's record of passage (trunks/passage.py)."""
-_KINDS, _MEASURED, _STEMS, _CLOUDS, _FREE, _SURFACE = range(6)
-"""What a source may tell or not: columns of `given`."""
+ROWS = ("p", "axis", "diameter", "cov", "height", "score", "kinds", "measured", "stems")
+"""What there is of each trunk."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -28,7 +29,7 @@ class Scans(Sequence[Trunks]):
         kinds: (N, 3), NaN where the source tells none; `measured` (N, 6), zeros; `stems` (N,), one.
         free: (S, SECTORS), zeros where a scan tells nothing, or (0, SECTORS) where none does; `eye` (S, 3).
         points: (M, 3) of all clouds; `cloud_ends` (N + 1,) where each begins.
-        given: (S, 6) what each scan's source told.
+        given: (S, 6) what each scan's source told: kinds, measured, stems, clouds, what it saw through; and whether `p` is on the surface.
     """
 
     stamps_ns: Stamps
@@ -55,8 +56,7 @@ class Scans(Sequence[Trunks]):
         if isinstance(trunks, Scans):
             return trunks
         builder = ScansBuilder()
-        for t in trunks:
-            builder.add(t)
+        builder.extend(trunks)
         return builder.build()
 
     def __len__(self) -> int:
@@ -103,8 +103,7 @@ class Scans(Sequence[Trunks]):
         """The scans in the order of time, each stamp once: themselves, where they are so already."""
         if (np.diff(self.stamps_ns) > 0).all():
             return self
-        order = np.argsort(self.stamps_ns, kind="stable")
-        return self.take(order[np.diff(self.stamps_ns[order], prepend=-(2**62)) > 0])
+        return self.take(rising(self.stamps_ns))
 
     def take(self, scans: NDArray[np.int64]) -> Scans:
         """Some of the scans (K,), in that order."""
@@ -120,7 +119,7 @@ class Scans(Sequence[Trunks]):
             points=self.points[_ranges(self.cloud_ends[:-1][row], size)],
             cloud_ends=_sum(size),
             given=self.given[scans],
-            **{k: getattr(self, k)[row] for k in _ROWS},
+            **{k: getattr(self, k)[row] for k in ROWS},
         )
 
     @staticmethod
@@ -130,7 +129,7 @@ class Scans(Sequence[Trunks]):
             return parts.pop()
         scans, rows, points = (sum(q) for q in zip(*((len(q), len(q.p), len(q.points)) for q in parts), strict=True))
         told = any(len(q.free) for q in parts)
-        length = {"points": points, "free": scans * told, **dict.fromkeys(_SCANS, scans), **dict.fromkeys(_ROWS, rows)}
+        length = {"points": points, "free": scans * told, **dict.fromkeys(_SCANS, scans), **dict.fromkeys(ROWS, rows)}
         whole = {k: np.zeros((n, *(v := getattr(parts[0], k)).shape[1:]), v.dtype) for k, n in length.items()}
         at = dict.fromkeys(length, 0)
         frames: list[str] = []
@@ -149,7 +148,6 @@ class Scans(Sequence[Trunks]):
 
 
 _SCANS = ("stamps_ns", "eye", "given")
-_ROWS = ("p", "axis", "diameter", "cov", "height", "score", "kinds", "measured", "stems")
 
 
 def _sum(count: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -212,8 +210,9 @@ def _columns(trunks: Sequence[Trunks]) -> Scans:
     free = np.zeros((n, SECTORS), np.uint32)
     for k, t in enumerate(trunks):
         full = [len(v) == len(t) for v in (t.kinds, t.measured, t.stems)]
-        given[k] = [*full, len(t.clouds) > 0, len(t.free) == SECTORS, t.surface]
-        if given[k, _FREE]:
+        looked = len(t.free) == SECTORS
+        given[k] = [*full, len(t.clouds) > 0, looked, t.surface]
+        if looked:
             free[k] = t.free
     clouds = [c for t in trunks for c in (t.clouds or [_NOTHING] * len(t))]
     return Scans(
@@ -229,7 +228,7 @@ def _columns(trunks: Sequence[Trunks]) -> Scans:
         kinds=rows("kinds", 3, missing=np.nan),
         measured=rows("measured", 6),
         stems=rows("stems", missing=1.0).astype(np.int64),
-        free=free if given[:, _FREE].any() else free[:0],
+        free=free if any(len(t.free) == SECTORS for t in trunks) else free[:0],
         eye=np.array([t.eye for t in trunks], float).reshape(-1, 3),
         points=np.concatenate([_NOTHING, *clouds]).astype(np.float32, copy=False),
         cloud_ends=_sum(np.array([len(c) for c in clouds], np.int64)),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from topograph.bags import Fix, Heading, Imu, Odometry
 from topograph.geometry import Array, Datum, Stamps, from_quaternion
-from topograph.session.columns import Column
+from topograph.session.columns import Column, rising
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,14 +138,10 @@ _P = TypeVar("_P", Fix, Heading)
 
 
 def _in_order(products: list[_P], name: str, skipped: Counter[str]) -> list[_P]:
-    ordered = sorted(products, key=lambda p: p.stamp_ns)
-    out: list[_P] = []
-    for p in ordered:
-        if out and p.stamp_ns <= out[-1].stamp_ns:
-            skipped[f"{name}: {REPEATED}"] += 1
-            continue
-        out.append(p)
-    return out
+    rows = rising(np.array([p.stamp_ns for p in products], np.int64))
+    if len(rows) < len(products):
+        skipped[f"{name}: {REPEATED}"] += len(products) - len(rows)
+    return [products[k] for k in rows.tolist()]
 
 
 HIGHEST = 20_000.0

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from topograph.bags import Trunks
 from topograph.geometry import Array, Stamps
-from topograph.session import Scans
+from topograph.session import ROWS, Scans
 
 LEAST_BELIEVED = 0.05
 """Share of its information that a sighting keeps however little its scan believed in it: many such may still be a tree."""
@@ -62,17 +62,15 @@ class Detections:
     def of(trunks: Iterable[Trunks]) -> Detections:
         """Trunks given scan by scan, already in `base_link`; on the same memory, where they come in columns and in order."""
         s = Scans.of(trunks).in_order()
-        rows = ("p", "cov", "axis", "height", "diameter", "score", "kinds", "measured", "stems")
         return Detections(
             stamps_ns=s.stamps_ns,
             scan=np.repeat(np.arange(len(s)), np.diff(s.ends)),
             source=np.arange(len(s.p)),
             free=s.free,
             eye=s.eye,
-            **{k: getattr(s, k) for k in rows},
+            **{k: getattr(s, k) for k in ROWS},
         )
 
     def select(self, keep: NDArray[np.bool_]) -> Detections:
         """The detections where `keep` (N,); all scans stay."""
-        per_row = ("scan", "p", "cov", "axis", "height", "diameter", "score", "kinds", "measured", "stems", "source")
-        return replace(self, **{k: getattr(self, k)[keep] for k in per_row})
+        return replace(self, **{k: getattr(self, k)[keep] for k in ("scan", "source", *ROWS)})

@@ -137,6 +137,18 @@ def test_trees_that_stand_twice_are_counted() -> None:
     assert audit.twice(np.concatenate([grid, grid[:8] + 0.4])) == pytest.approx(16 / 38)
 
 
+def test_trees_that_may_be_posts_are_doubted() -> None:
+    """In a recorded street half of the "trees" are masts and pillars, with probabilities of 0.6 to 0.98."""
+    nan = float("nan")
+    (found,) = audit.unsure(np.array([0.98, 0.97, 0.95, 0.89, 0.7, 0.6, 0.8, nan, nan]))
+    assert found.name == "kinds"
+    assert found.value == pytest.approx(4 / 7)
+    assert not found.refuses
+    assert not list(audit.unsure(np.full(20, 0.95)))
+    assert not list(audit.unsure(np.r_[np.full(17, 0.95), 0.5, 0.5, 0.5, 0.5]))
+    assert not list(audit.unsure(np.full(20, nan)))  # recorded detections tell no kinds
+
+
 def test_trees_that_hardly_a_scan_shows_are_doubted() -> None:
     """A LiDAR that lies on its side gave "1 trees, sound" of 300 scans."""
     (found,) = audit.seldom(300, 29)

@@ -198,12 +198,13 @@ def judge(plot: Plot, looks: list[Look], trunks: list[Trunks]) -> SweepResult:
 
 @dataclass(frozen=True)
 class Mapped:
-    """A map at known poses: points on the axes (T, 3) at `height` (T,) above ground, kinds, diameters, stated sigma (T,)."""
+    """A map at known poses: points on the axes (T, 3) at `height` (T,) above ground, kinds with their probability, diameters, stated sigma (T,)."""
 
     p: Array
     height: Array
     foot: Array
     kind: NDArray[np.int64]
+    probability: Array
     diameter: Array
     sigma: Array
 
@@ -235,7 +236,9 @@ def map_at(poses: Array, trunks: list[Trunks], config: Config) -> Mapped:
     e = exists(d, tree, poses, place, config.trees)
     foot = place - s.axis * (s.height / s.axis[:, 2])[:, None]
     ok = np.flatnonzero(e.ok)
-    return Mapped(place[ok], s.height[ok], foot[ok], e.kind[ok], s.diameter[ok], 1.0 / np.sqrt(total[ok]))
+    return Mapped(
+        place[ok], s.height[ok], foot[ok], e.kind[ok], e.probability[ok], s.diameter[ok], 1.0 / np.sqrt(total[ok])
+    )
 
 
 def labels() -> Array:

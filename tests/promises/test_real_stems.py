@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import recordings as rec
 
+from topograph import audit
 from topograph.bags import Trunks
 from topograph.config import Config
 from topograph.evaluate.metrics import match
@@ -79,6 +80,7 @@ def test_the_map_of_twenty_looks(shared: Path, name: str) -> None:
     p, w = plot(name), looks(name)
     m = rec.map_at(np.array([k.plot_T_base for k in w]), detect(name, w, LEVEL), Config())
     tree = m.p[m.kind == 0]
+    assert not list(audit.unsure(m.probability[m.kind == 0]))
     i, j = match(tree[:, :2], p.stems[:, :2], rec.GATE)
     assert len(i) >= 0.95 * len(p.stems)
     others = np.setdiff1d(np.arange(len(tree)), i)

@@ -9,7 +9,7 @@ import recordings as rec
 from topograph.config import Config
 from topograph.geometry import transform
 from topograph.mapping import map_T_scans
-from topograph.pipeline import read_run, solve_run
+from topograph.pipeline import audited, read_run, solve_run
 
 
 def test_nodes_stand_still_and_stop_the_beam(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
@@ -29,3 +29,5 @@ def test_nodes_stand_still_and_stop_the_beam(shared: Path, tmp_path_factory: pyt
         # A pillar a metre thick shows another side when passed; a vehicle that moves goes further.
         assert np.linalg.norm(shift) < 1.0
     assert any("moved" in n for n in solved.run.notes)
+    # Masts and pillars are called trees here, two of three; the map does not say so without a word.
+    assert any(f.name == "kinds" for f in audited(solved).findings)

@@ -12,6 +12,7 @@ from topograph.audit.checks import (
     trunks,
     twice,
     unclaimed,
+    unsure,
 )
 from topograph.audit.verdict import Finding, Verdict
 
@@ -29,4 +30,5 @@ __all__ = [
     "trunks",
     "twice",
     "unclaimed",
+    "unsure",
 ]

@@ -23,6 +23,7 @@ def audited(solved: Solved) -> Verdict:
         *audit.trunks(p, e, solved.moving, solved.existence.kind == TREE),
         *_unclaimed(solved),
         *_seldom(solved),
+        *audit.unsure(solved.existence.probability[solved.existence.kind == TREE]),
         *_mounts(solved),
     ]
     if any(f.name == "moving" for f in found):  # the same cause, and said of it

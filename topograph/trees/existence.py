@@ -16,10 +16,11 @@ from topograph.trees.screen import parts_apart
 from topograph.trees.tracks import TreesConfig
 from topograph.trunks.score import KIND_PRIOR, KINDS, OTHER, TREE, column_odds
 
-FRESH = 0.25
+FRESH = 0.05
 """Share of what a further sighting of the same tree says that the ones before have not said."""
-MOST = 6.0
-"""Sightings that count at most: looks from all sides still share the tree."""
+MOST = 1.5
+"""Sightings that count at most: looks from all sides still share the tree. (Log-likelihood of the kinds of 1,200 landmarks in 33 simulated runs, seeds 401-403,
+and a street: -502 with 0.25 and 6, -344 with 0.1 and 2, -317 so; the kinds chosen are the same but for one tree in 1,100.)"""
 SLIPS = 2.0
 """Scans that may have seen through a tree by mistake: a mixed pixel, a pose that is off for a moment."""
 STILL = 0.6

@@ -18,13 +18,13 @@ from topograph.evaluate import Truth, read_tum
 from topograph.geometry import Array, interpolate
 from topograph.localize import LocalizeConfig, Localizer, ThesisConfig, ThesisMethod
 from topograph.localize.engine import Engine
-from topograph.localize.evidence import describe, weigh
 from topograph.localize.filter import Filter
-from topograph.localize.index import MapIndex, build_index
-from topograph.localize.search import search
+from topograph.localize.posterior import describe, weigh
 from topograph.localize.submap import Move, Submap, Sweep, Visibility
 from topograph.localize.thesis import multilaterate
 from topograph.motion import Leg, Reckoner
+from topograph.places.index import MapIndex, build_index
+from topograph.places.search import search
 from topograph.simulate import DESIGNS, DriveConfig, SensorConfig, record
 from topograph.simulate.starts import SCENARIOS, StartsConfig, drive, world
 from topograph.topomap import TopoMap
@@ -135,7 +135,7 @@ def hunted(trees: Array, seen: Array, config: LocalizeConfig):
     for _ in range(3):
         submap.step(still(), sweep(seen))
     marks, _ = describe(submap, index, config)
-    return weigh(search(marks, index, config), marks, submap, index, config)
+    return weigh(search(marks, index, config.places), marks, submap, index, config)
 
 
 @given(seeds, st.floats(-3.0, 3.0), st.floats(-500, 500), st.floats(-500, 500))

@@ -23,9 +23,9 @@ from topograph.bags import Trunks
 from topograph.localize import ThesisConfig, ThesisMethod
 from topograph.localize.config import LocalizeConfig
 from topograph.localize.engine import Belief, Engine
-from topograph.localize.index import MapIndex, build_index
 from topograph.localize.submap import Move, Sweep
 from topograph.motion import Leg
+from topograph.places.index import MapIndex, build_index
 from topograph.simulate.starts import SCENARIOS, StartsConfig, Step, World, drive, world
 from topograph.topomap import TopoMap
 
@@ -382,8 +382,8 @@ def latency(seed: int, quick: float) -> None:
 
 def cost(seed: int, quick: float, picture: Path) -> None:
     """Search time, update time and memory against the size of the map, on one core, drawn to `picture`."""
-    from topograph.localize.evidence import describe, weigh
-    from topograph.localize.search import search
+    from topograph.localize.posterior import describe, weigh
+    from topograph.places.search import search
 
     rows = []
     for n in (100, 300, 1000, 3000, 10000, 30000, 100000):
@@ -402,7 +402,7 @@ def cost(seed: int, quick: float, picture: Path) -> None:
             for _ in range(3):
                 began = time.perf_counter()
                 marks, _ = describe(engine.hunt.submap, index, config)
-                weigh(search(marks, index, config), marks, engine.hunt.submap, index, config)
+                weigh(search(marks, index, config.places), marks, engine.hunt.submap, index, config)
                 times.append(1e3 * (time.perf_counter() - began))
             run = [start(seed + k, c, config, 6.0) for k in range(3 if n < 50000 else 1)]
             update = float(np.median(np.concatenate([r.ms for r in run])))

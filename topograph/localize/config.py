@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from topograph.places import PlacesConfig
 from topograph.ranges import Chance, Count, NonNegative, Positive, Share
 
 
@@ -83,3 +84,11 @@ class LocalizeConfig:
     planar_tilt: Positive = 0.06
     estimator: Literal["graph", "filter"] = "graph"
     measure: Literal["both", "ranges", "bearings"] = "both"
+
+    @property
+    def places(self) -> PlacesConfig:
+        """What the place search is told."""
+        return PlacesConfig(
+            map_sigma=self.map_sigma, anchors=self.anchors, bound=self.bound, modes=self.modes, felled=self.felled,
+            scales=self.scales, scale_prior=self.scale_prior,
+        )  # fmt: skip

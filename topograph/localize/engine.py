@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from topograph.geometry import Array
 from topograph.localize.config import LocalizeConfig
-from topograph.localize.evidence import Posterior, describe, nothing, weigh
 from topograph.localize.filter import Filter
 from topograph.localize.filter_kernels import assign, in_view
 from topograph.localize.hypothesis import DRAGGED, Hypothesis
-from topograph.localize.index import MapIndex
-from topograph.localize.search import Found, Landmarks, search, searching
-from topograph.localize.search_kernels import within_kernel
+from topograph.localize.posterior import Posterior, describe, nothing, weigh
 from topograph.localize.submap import BINS, Move, Submap, Sweep, Visibility, absorb, in_reach, sectors
+from topograph.places import Found, Landmarks, MapIndex, search, searching
+from topograph.places.search_kernels import within_kernel
 
 ASTRAY = 0.3
 """Deviation of a tree's place in the middle of the view, in mean spacings of trees, beyond which it is searched anew."""
@@ -154,7 +153,7 @@ class Engine:
             h.posterior, h.rows = weigh(self._kept(h), marks, h.submap, self.index, c), rows
             if h.posterior.risk > c.risk:
                 return True
-        h.found = search(marks, self.index, c)
+        h.found = search(marks, self.index, c.places)
         h.searched = f.run
         h.posterior, h.rows = weigh(h.found, marks, h.submap, self.index, c), rows
         return True
@@ -172,7 +171,7 @@ class Engine:
             marks, _ = describe(h.submap, self.index, c)
             if self._bits(marks) < self._need():
                 return False
-            h.search = searching(marks, self.index, c)
+            h.search = searching(marks, self.index, c.places)
         found = next(h.search)
         if found is None:
             return False

@@ -15,10 +15,10 @@ from topograph.errors import InsufficientDataError
 from topograph.geometry import Array, from_xyz_rpy, transform, yaw_of
 from topograph.localize.config import LocalizeConfig
 from topograph.localize.engine import Belief, Engine
-from topograph.localize.index import build_index
 from topograph.localize.method import Fix, Method, Report
 from topograph.localize.submap import Move, Sweep
 from topograph.motion import Leg, Reckoner
+from topograph.places.index import build_index
 from topograph.topomap import TopoMap
 from topograph.trees import SlipWatch
 from topograph.trunks import none_at

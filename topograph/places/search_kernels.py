@@ -22,6 +22,15 @@ class Marks(NamedTuple):
     other: Array
 
 
+class Prior(NamedTuple):
+    """What is known beforehand of where the landmarks' frame lies: `at` (3,) x, y, yaw, deviations `sigma` (m, per axis) and `yaw_sigma` (rad);
+    infinite: nothing."""
+
+    at: Array
+    sigma: float
+    yaw_sigma: float
+
+
 class Trees(NamedTuple):
     """The map's trees and the raster that finds the nearest: see `index.MapIndex`."""
 
@@ -62,9 +71,10 @@ def fill_kernel(nearest, xy, low, cell, reach):
 
 
 @njit(cache=True, error_model="numpy", fastmath=True)
-def seed_kernel(marks, order, pa, pb, trees, best, bound, map_sigma):
+def seed_kernel(marks, order, pa, pb, trees, best, bound, map_sigma, prior):
     """Placements (K, 3) by the pairs of trees `pa`, `pb` as far apart as the first two landmarks in `order`, their losses (K,), and the
     best loss so far; dropped when `bound` behind it. `marks.other` is what a landmark costs that is no mapped tree.
+    A `prior` adds what the distance from it costs; where a pair alone tells the pose badly, it costs the less.
     """
     m, var, other, dia, dia_var = marks.m, marks.var, marks.other, marks.diameter, marks.diameter_var
     xy, tvar, tdia, dmean, dsd = trees.xy, trees.var, trees.diameter, trees.diameter_mean, trees.diameter_sd
@@ -75,6 +85,7 @@ def seed_kernel(marks, order, pa, pb, trees, best, bound, map_sigma):
     count = 0
     i, j = order[0], order[1]
     base = map_sigma * map_sigma
+    near = prior.sigma < 1e9
     volume = np.empty(n)
     floor = np.empty(n)  # the least that a landmark can cost: then a running loss only rises
     for q in range(n):
@@ -103,6 +114,12 @@ def seed_kernel(marks, order, pa, pb, trees, best, bound, map_sigma):
         gap = np.sqrt(fx * fx + fy * fy) - np.sqrt(ex * ex + ey * ey)
         loss += 3.0 * np.log(1.0 + gap * gap * w2 / 4.0)
         loss += volume[i] - floor[i] + volume[j] - floor[j]
+        away = 0.0
+        if near:
+            away = away_kernel(prior, tx - c * mx + sn * my, ty - sn * mx - c * my, c, sn, mx, my, W, inertia)
+            loss += away
+            if loss > best + bound:
+                continue
         u0, u1 = a, b
         for o in range(2, n):
             k = order[o]
@@ -142,6 +159,8 @@ def seed_kernel(marks, order, pa, pb, trees, best, bound, map_sigma):
                 ty += qy * w / W
                 h = np.sqrt(dot * dot + cross * cross)
                 c, sn = dot / h, cross / h
+        if near:
+            loss += away_kernel(prior, tx - c * mx + sn * my, ty - sn * mx - c * my, c, sn, mx, my, W, inertia) - away
         if loss > best + bound:
             continue
         if loss < best:
@@ -166,6 +185,18 @@ def seed_kernel(marks, order, pa, pb, trees, best, bound, map_sigma):
         losses[count] = loss
         count += 1
     return out[:count].copy(), losses[:count].copy(), best
+
+
+@njit(cache=True, error_model="numpy")
+def away_kernel(prior, x, y, c, s, mx, my, W, inertia):
+    """What a placement (x, y; cosine and sine of its yaw) costs by its distance from the prior. It is known to 1/W about the mean (mx, my) of its
+    landmarks and to 1/inertia in yaw."""
+    turn = 1.0 / inertia
+    place = prior.sigma * prior.sigma + 1.0 / W + (mx * mx + my * my) * turn
+    dx, dy = x - prior.at[0], y - prior.at[1]
+    ca, sa = np.cos(prior.at[2]), np.sin(prior.at[2])
+    d = np.arctan2(s * ca - c * sa, c * ca + s * sa)
+    return 0.5 * (dx * dx + dy * dy) / place + 0.5 * d * d / (prior.yaw_sigma * prior.yaw_sigma + turn)
 
 
 @njit(cache=True, error_model="numpy")

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from topograph.compiled import determinant3, solve3
-from topograph.localize.search_kernels import diameter_kernel
+from topograph.places.search_kernels import diameter_kernel
 
 
 @njit(cache=True, error_model="numpy")
@@ -82,7 +82,8 @@ def match_kernel(c, s, x, y, marks, trees, base, seen, so):
 
 @njit(cache=True, error_model="numpy")
 def evidence_kernel(poses, marks, P, trees, grid, raster, so, felled, base, trust, wild, scales, prior):
-    """Of each placement (M, 3): log evidence (M,), the placement aligned (M, 3), mapped tree (M, n) of each landmark, noise scale (M,), and
+    """Of each placement (M, 3): log evidence (M,), the placement aligned (M, 3), its information
+    (M, 3, 3), mapped tree (M, n) of each landmark, noise scale (M,), and
     the log evidence (M,) of an orchard of the same design. `P` (2n, 2n) is the landmarks' covariance; see evidence.py.
     """
     m, tree, other, dia, dia_var = marks.m, marks.tree, marks.other, marks.diameter, marks.diameter_var
@@ -92,6 +93,7 @@ def evidence_kernel(poses, marks, P, trees, grid, raster, so, felled, base, trus
     alike = np.full(M, -np.inf)
     out = poses.copy()
     matched = np.full((M, n), -1, np.int64)
+    information = np.zeros((M, 3, 3))
     scale = np.ones(M)
     seen = chance_kernel(raster, felled)
     centre = np.array([so[0] + 0.5 * raster.shape[0], so[1] + 0.5 * raster.shape[1]])
@@ -142,6 +144,7 @@ def evidence_kernel(poses, marks, P, trees, grid, raster, so, felled, base, trus
             total += np.exp(half - 0.5 * trust * q / scales[a] ** 2 - dof * np.log(scales[a]) + prior[a] - top)
         log[h] = fixed + top + np.log(total)
         out[h, 0], out[h, 1], out[h, 2] = x, y, yaw
+        information[h] = L
         for i in range(n):
             matched[h, i] = ids[i]
         if log[h] > best:
@@ -154,7 +157,7 @@ def evidence_kernel(poses, marks, P, trees, grid, raster, so, felled, base, trus
                     fixed - 0.5 * trust * qa - 0.5 * la - 0.5 * np.log(determinant3(La)) + (1.5 - k) * np.log(2 * np.pi)
                 )
                 alike[h] = np.logaddexp(alike[h], anew - np.log(len(scales)))
-    return log, out, matched, scale, alike
+    return log, out, information, matched, scale, alike
 
 
 @njit(cache=True, error_model="numpy")

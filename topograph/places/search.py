@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from topograph.geometry import Array
-from topograph.localize.config import LocalizeConfig
-from topograph.localize.index import MapIndex
-from topograph.localize.search_kernels import Marks, distinct_kernel, seed_kernel
+from topograph.places.config import PlacesConfig
+from topograph.places.index import MapIndex
+from topograph.places.search_kernels import Marks, Prior, distinct_kernel, seed_kernel
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,23 +72,25 @@ def spread(m: Array, cov: Array) -> Array:
     return np.asarray(np.maximum(0.5 * (v[0::2] + v[1::2]), 1e-6))
 
 
+ANYWHERE = Prior(np.zeros(3), np.inf, np.inf)
+"""Nothing is known of the place beforehand."""
 SLICE = 8_000
 """Pairs of trees that are tried at once while tracking: some ten milliseconds."""
 FEWER = 40
 """Placements that are weighed with their full covariance while tracking; those beyond count as rivals all the same."""
 
 
-def search(marks: Landmarks, index: MapIndex, config: LocalizeConfig) -> Found:
-    """Placements within `config.bound` nats of the best."""
-    for found in searching(marks, index, config, len(index.length) + 1, config.modes):
+def search(marks: Landmarks, index: MapIndex, config: PlacesConfig, prior: Prior = ANYWHERE) -> Found:
+    """Placements within `config.bound` nats of the best, those far off the `prior` left out."""
+    for found in searching(marks, index, config, len(index.length) + 1, config.modes, prior):
         if found is not None:
             return found
     raise AssertionError("a search ends with what it found")
 
 
 def searching(
-    marks: Landmarks, index: MapIndex, config: LocalizeConfig, size: int = SLICE, modes: int = FEWER
-) -> Iterator[Found | None]:
+    marks: Landmarks, index: MapIndex, config: PlacesConfig, size: int = SLICE, modes: int = FEWER, prior: Prior = ANYWHERE,
+) -> Iterator[Found | None]:  # fmt: skip
     """`search` in slices of so many pairs of trees: None while it goes on, then what it found."""
     pairs = _anchors(marks, index, config)
     poses: list[Array] = []
@@ -107,7 +109,9 @@ def searching(
             if len(a) > 5000:  # neighbours after each other: the raster's cells are still in the processor's cache
                 near = np.argsort(index.place[a], kind="stable")
                 a, b = a[near], b[near]
-            pose, loss, best = seed_kernel(bundle, order, a, b, index.trees, best, config.bound, config.map_sigma)
+            pose, loss, best = seed_kernel(
+                bundle, order, a, b, index.trees, best, config.bound, config.map_sigma, prior
+            )
             poses.append(pose)
             losses.append(loss)
             tried += len(a)
@@ -129,7 +133,7 @@ def searching(
     yield Found(pose[rows][kept], loss[rows][kept], rest * (len(loss) / max(len(rows), 1)), seeds)
 
 
-def _anchors(marks: Landmarks, index: MapIndex, config: LocalizeConfig) -> list[tuple[int, int, float, int, int]]:
+def _anchors(marks: Landmarks, index: MapIndex, config: PlacesConfig) -> list[tuple[int, int, float, int, int]]:
     """Pairs (i, j) of landmarks, the chance that both are mapped trees, and the range of tree pairs as far apart.
 
     First pairs of disjoint landmarks, the surest first: never those with the fewest candidates, for an odd distance is

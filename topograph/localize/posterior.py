@@ -1,11 +1,5 @@
-"""How probable a placement of the submap is: closed-form evidence with the full joint covariance.
-
-A placement explains each landmark as a mapped tree (density around it, chance of having been seen, diameter) or as
-something else (a density over the plane), and each mapped tree in view that was not seen as missed. The three degrees of
-freedom of the placement are integrated out (Laplace); the common noise scale is marginalised over a few values.
-
-Two further hypotheses stand beside the placements: "not on this map" (trees at random), and "another orchard of the same
-design" (trees near the map's lattice, but off by a planting error of their own).
+"""How probable placements of the submap are, beside two further hypotheses: "not on this map" (trees at random), and "another
+orchard of the same design" (trees near the map's lattice, but off by a planting error of their own).
 """
 
 from __future__ import annotations
@@ -17,10 +11,9 @@ from numpy.typing import NDArray
 
 from topograph.geometry import Array
 from topograph.localize.config import LocalizeConfig
-from topograph.localize.evidence_kernels import chance_kernel, evidence_kernel, unlike_kernel
-from topograph.localize.index import MapIndex
-from topograph.localize.search import Found, Landmarks, spread
 from topograph.localize.submap import Submap
+from topograph.places import Found, Landmarks, MapIndex, placements, spread
+from topograph.places.evidence_kernels import chance_kernel
 
 LOOKS_EVERY = 2.0
 """Metres after which a further look counts as a new trial for the prior of another orchard."""
@@ -104,22 +97,12 @@ def _beta_binomial(hits: Array, looks: Array, a: float, b: float) -> Array:
 def weigh(found: Found, marks: Landmarks, submap: Submap, index: MapIndex, config: LocalizeConfig) -> Posterior:
     """Posterior over placements that a search found (or an earlier posterior held)."""
     c = config
-    n = len(marks)
-    if not len(found.pose) or n < 2:
+    if not len(found.pose) or len(marks) < 2:
         return nothing()
-    scales, prior = np.array(c.scales), np.log(np.array(c.scale_prior) / np.sum(c.scale_prior))
-    log, pose, tree, scale, alike = evidence_kernel(
-        found.pose, marks.bundle, marks.cov, index.trees, index.grid, submap.raster, submap.origin, c.felled, c.map_sigma**2,
-        index.trust, 2.0 * index.jitter**2, scales, prior,
-    )  # fmt: skip
-    order = np.argsort(-log)
-    order = order[np.isfinite(log[order])]
-    order = order[unlike_kernel(pose[order], marks.m.mean(0))]
-    if not len(order):
+    placed = placements(found, marks, submap.raster, submap.origin, index, c.places)
+    if not len(placed):
         return nothing()
-    log, pose, tree, scale = log[order], pose[order], tree[order], scale[order]
-    flat = np.log(1.0 - c.unknown - c.alike) - np.log(index.area * 2 * np.pi)
-    placed = log + flat
+    log = placed.log + np.log(1.0 - c.unknown - c.alike) - np.log(index.area * 2 * np.pi)
     # Trees at random, with the density of the map where the submap looked.
     seen = chance_kernel(submap.raster, c.felled)
     at = np.clip((marks.m - submap.origin).astype(int), 0, np.array(submap.raster.shape) - 1)
@@ -127,20 +110,20 @@ def weigh(found: Found, marks: Landmarks, submap: Submap, index: MapIndex, confi
     random = float(np.sum(np.logaddexp(marks.tree + np.log(index.density * here), marks.other)))
     random -= index.density * float(seen.sum())
     # Another orchard of this design: any of its placements would do, so its prior is spread over one cell of the lattice.
-    design = float(alike[np.isfinite(alike)].max(initial=-np.inf)) - np.log(np.pi / (2.0 * index.density))
+    design = placed.alike - np.log(np.pi / (2.0 * index.density))
     # Looking again and again finds a lucky fit sooner or later: the longer nothing was sure, the more is asked.
     alike_prior = c.alike * max(1.0, submap.filter.run / LOOKS_EVERY)
     unknown = np.logaddexp(np.log(c.unknown) + random, np.log(alike_prior) + design)
-    rest = (np.log(found.rest) + placed.min()) if found.rest > 0 else -np.inf
-    dropped = np.log(max(found.seeds, 1)) - c.bound + placed.max()
+    rest = (np.log(found.rest) + log.min()) if found.rest > 0 else -np.inf
+    dropped = np.log(max(found.seeds, 1)) - c.bound + log.max()
     rest = np.logaddexp(rest, dropped)
-    total = np.logaddexp(np.logaddexp.reduce(placed), np.logaddexp(unknown, rest))
+    total = np.logaddexp(np.logaddexp.reduce(log), np.logaddexp(unknown, rest))
     return Posterior(
-        pose=pose,
-        p=np.exp(placed - total),
+        pose=placed.pose,
+        p=np.exp(log - total),
         unknown=float(np.exp(unknown - total)),
         rest=float(np.exp(rest - total)),
-        tree=tree,
-        scale=scale,
-        log=placed,
+        tree=placed.tree,
+        scale=placed.scale,
+        log=log,
     )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from topograph.geometry import Array
-from topograph.localize.search_kernels import Grid, Trees, fill_kernel
+from topograph.places.search_kernels import Grid, Trees, fill_kernel
 
 DIAMETER_NOISE = 0.02
 """Standard deviation of a mapped diameter, m: orchards whose diameters vary no more than this are all alike."""

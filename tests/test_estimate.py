@@ -3,13 +3,24 @@
 from dataclasses import replace
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from topograph.config import Config
-from topograph.estimate import AverageConfig, Estimate, EstimateConfig, Headings, Problem, average, graph, path_at
+from topograph.estimate import (
+    AverageConfig,
+    Estimate,
+    EstimateConfig,
+    Headings,
+    Problem,
+    average,
+    graph,
+    path_at,
+    solver,
+)
 from topograph.estimate.assemble import no_fixes
 from topograph.evaluate import Truth, map_metrics
 from topograph.geometry import exp, inverse, planar, transform
@@ -215,3 +226,21 @@ def test_estimates_repeat_bit_for_bit(detections_run: tuple[Path, Truth]) -> Non
     a, b = (solve_run(read_run([detections_run[0]], Config()), Config()).estimate for _ in range(2))
     assert isinstance(a, Estimate)
     np.testing.assert_array_equal(a.trees, b.trees)
+
+
+def test_a_large_graph_with_a_variable_that_nothing_joins_is_solved() -> None:
+    """GTSAM hands METIS an adjacency without such a variable, and METIS reads beyond its end: a crash of the whole program."""
+    n = solver.LARGE + 100
+    nonlinear, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    unit = gtsam.noiseModel.Unit.Create(3)
+    for k in range(n + 1):
+        values.insert(k, gtsam.Pose2())
+    for k in range(n - 1):
+        nonlinear.add(gtsam.BetweenFactorPose2(k, k + 1, gtsam.Pose2(1.0, 0.0, 0.0), unit))
+    nonlinear.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(), unit))
+    nonlinear.add(gtsam.PriorFactorPose2(n, gtsam.Pose2(5.0, 6.0, 0.0), unit))
+    solved = solver.optimised(nonlinear, values, 5)
+    assert solved.atPose2(n - 1).x() == pytest.approx(n - 1)
+    assert solved.atPose2(n).y() == pytest.approx(6.0)
+    linear = nonlinear.linearize(solved)
+    assert solver.ordering_of(linear, n + 1).size() == n + 1

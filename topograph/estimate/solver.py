@@ -61,10 +61,23 @@ def optimised(graph: Any, values: Any, iterations: int, tolerance: float = 1e-5)
 
 def ordering_of(graph: Any, variables: int) -> Any:
     """In which the variables of a graph, linear or not, are eliminated."""
-    kind = gtsam.Ordering.OrderingType.METIS if variables > LARGE else gtsam.Ordering.OrderingType.COLAMD
+    metis = variables > LARGE and not _alone(graph)
+    kind = gtsam.Ordering.OrderingType.METIS if metis else gtsam.Ordering.OrderingType.COLAMD
     linear = isinstance(graph, gtsam.GaussianFactorGraph)
     create = gtsam.Ordering.CreateGaussianFactorGraph if linear else gtsam.Ordering.CreateNonlinearFactorGraph
     return create(kind, graph)
+
+
+def _alone(graph: Any) -> bool:
+    """Whether a variable shares no factor with another one (a tree none of whose sightings is believed): METIS would be handed an
+    adjacency without it and read beyond its end.
+    """
+    keys: set[int] = set()
+    joined: set[int] = set()
+    for k in range(graph.size()):
+        mine = graph.at(k).keys()
+        (joined if len(mine) > 1 else keys).update(mine)
+    return not keys <= joined
 
 
 def _optimised(graph: Any, values: Any, iterations: int, tolerance: float) -> Any:

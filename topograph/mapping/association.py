@@ -17,6 +17,9 @@ from topograph.trees import (
     LoopCloser,
     Shapes,
     TrackTable,
+    Way,
+    deviation,
+    drift,
     exists,
     gather,
     moved_pose,
@@ -49,7 +52,7 @@ class Association:
         self.seen = AtKeyframes.of(problem.detections, problem.stamps_ns, problem.motion)
         self.tracks = int(self.track.max(initial=-1)) + 1
         self.known = len(problem.known.p) if problem.known is not None else 0
-        self.closer = LoopCloser(self.tracks + self.known, problem.motion.gyro, config.trees, config.motion)
+        self.closer = LoopCloser(self.tracks + self.known, problem.motion, config.trees, config.motion)
         self.tree_of_track = self.closer.tree
 
     def poses(self, e: Estimate) -> Array:
@@ -74,6 +77,10 @@ class Association:
             last=np.concatenate([t.last, long_ago]),
             hits=np.concatenate([t.hits, np.full(self.known, 1000)]),
         )
+
+    def way(self, e: Estimate) -> Way:
+        """The path as estimated."""
+        return Way.of(self.problem.motion.distance_at(e.stamps_ns), e.map_T_robot)
 
     def solve(self, e: Estimate, *, least: int = 3, patient: bool = False, link: Link | None = None) -> Estimate:
         """An estimate without covariances of the trees as they are now; `patient`: until it has converged."""
@@ -156,8 +163,8 @@ def associate_and_solve(
         return empty, replace(graph.solve(problem, config.estimate), tree=none), 0
     a = Association(problem, track, config)
     end = float(problem.motion.distance[-1])
-    cap = _gnss_cap(problem, a.closer)
-    while a.closer.advance(a.table(estimate), end, cap):
+    cap = _gnss_cap(problem, a.way(estimate), config)
+    while a.closer.advance(a.table(estimate), a.way(estimate), end, cap):
         progress("associate", min(1.0, a.closer.at / max(end, 1e-9)))
         a.tree_of_track = a.closer.tree
         estimate = a.solve(estimate, link=_link(problem, estimate, a.closer))
@@ -198,7 +205,7 @@ def _settled(after: Decided, before: Decided) -> bool:
     return flips <= FLIPS * len(after.tree) and np.array_equal(after.shapes.forked, before.shapes.forked)
 
 
-LAST_ROUNDS = 4
+LAST_ROUNDS = 8
 """Association and solve go on until neither changes, the last solve included; at most so often."""
 SETTLED = 0.01
 """Slopes of trees that change by less between two solves do not change what was solved, m/m."""
@@ -217,7 +224,7 @@ def _link(problem: Problem, estimate: Estimate, closer: LoopCloser) -> Link | No
     return Link(a, b, inverse(poses[a]) @ moved_pose(poses[b], centre, move))
 
 
-def _gnss_cap(problem: Problem, closer: LoopCloser) -> float:
+def _gnss_cap(problem: Problem, way: Way, config: MappingConfig) -> float:
     """How far the path may be off where GNSS holds it, m: a few of its deviations, and the drift of its longest gap."""
     f = problem.fixes
     if len(f.keyframe) < 3:
@@ -225,4 +232,7 @@ def _gnss_cap(problem: Problem, closer: LoopCloser) -> float:
     at = problem.motion.distance_at(problem.stamps_ns)
     edges = np.concatenate([[at[0]], at[f.keyframe], [at[-1]]])
     sigma = float(np.sqrt(np.median(f.cov[:, 0, 0])))
-    return max(0.5, 4.0 * sigma) + closer.drift(0.5 * float(np.diff(edges).max()))[0]
+    gap = int(np.argmax(np.diff(edges)))
+    begin, end = edges[gap], 0.5 * (edges[gap] + edges[gap + 1])
+    off = drift(way, begin, end, way.at(np.array([end]))[0, :2], problem.motion, config.motion)
+    return max(0.5, 4.0 * sigma) + deviation(off)

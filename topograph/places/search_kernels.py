@@ -23,11 +23,11 @@ class Marks(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """What is known beforehand of where the landmarks' frame lies: `at` (3,) x, y, yaw, deviations `sigma` (m, per axis) and `yaw_sigma` (rad);
-    infinite: nothing."""
+    """What is known beforehand of where the landmarks' frame lies: `at` (3,) x, y, yaw, covariance `cov` (2, 2) of the place, m², deviation
+    `yaw_sigma` of the yaw, rad; infinite: nothing."""
 
     at: Array
-    sigma: float
+    cov: Array
     yaw_sigma: float
 
 
@@ -85,7 +85,7 @@ def seed_kernel(marks, order, pa, pb, trees, best, bound, map_sigma, prior):
     count = 0
     i, j = order[0], order[1]
     base = map_sigma * map_sigma
-    near = prior.sigma < 1e9
+    near = prior.yaw_sigma < 1e9
     volume = np.empty(n)
     floor = np.empty(n)  # the least that a landmark can cost: then a running loss only rises
     for q in range(n):
@@ -192,11 +192,13 @@ def away_kernel(prior, x, y, c, s, mx, my, W, inertia):
     """What a placement (x, y; cosine and sine of its yaw) costs by its distance from the prior. It is known to 1/W about the mean (mx, my) of its
     landmarks and to 1/inertia in yaw."""
     turn = 1.0 / inertia
-    place = prior.sigma * prior.sigma + 1.0 / W + (mx * mx + my * my) * turn
+    own = 1.0 / W + (mx * mx + my * my) * turn
+    xx, yy, xy = prior.cov[0, 0] + own, prior.cov[1, 1] + own, prior.cov[0, 1]
     dx, dy = x - prior.at[0], y - prior.at[1]
     ca, sa = np.cos(prior.at[2]), np.sin(prior.at[2])
     d = np.arctan2(s * ca - c * sa, c * ca + s * sa)
-    return 0.5 * (dx * dx + dy * dy) / place + 0.5 * d * d / (prior.yaw_sigma * prior.yaw_sigma + turn)
+    place = (yy * dx * dx - 2.0 * xy * dx * dy + xx * dy * dy) / (xx * yy - xy * xy)
+    return 0.5 * place + 0.5 * d * d / (prior.yaw_sigma * prior.yaw_sigma + turn)
 
 
 @njit(cache=True, error_model="numpy")

@@ -1,6 +1,7 @@
 """Trunks + a predicted path -> which trunks are one tree: tracking, loop closing, births and deaths."""
 
 from topograph.trees.detections import Detections
+from topograph.trees.drift import Way, deviation, drift
 from topograph.trees.existence import Existence, exists, seen_through
 from topograph.trees.foot import grounds
 from topograph.trees.keyframes import choose_keyframes
@@ -24,7 +25,10 @@ __all__ = [
     "TrackTable",
     "Tracker",
     "TreesConfig",
+    "Way",
     "choose_keyframes",
+    "deviation",
+    "drift",
     "exists",
     "follow",
     "gather",

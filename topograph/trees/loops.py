@@ -7,15 +7,17 @@ being on old ground at all; otherwise the decision waits for more trees.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from topograph.geometry import Array, fit_rigid_2d, planar, transform
-from topograph.motion import MotionConfig
+from topograph.geometry import Array, planar, transform
+from topograph.motion import Motion, MotionConfig
+from topograph.places import Landmarks, PlacesConfig, Prior, build_index, placements, search, spread
 from topograph.trees.detections import Detections
+from topograph.trees.drift import Way, bounded, deviation, drift
 from topograph.trees.tracks import TreesConfig
 from topograph.trunks.score import POST, TREE
 
@@ -54,31 +56,26 @@ class LoopCloser:
             the new piece turns, and its move (x, y, yaw); see `moved_pose`.
     """
 
-    def __init__(self, tracks: int, gyro: bool, config: TreesConfig, motion: MotionConfig) -> None:
+    def __init__(self, tracks: int, motion: Motion, config: TreesConfig, noise: MotionConfig) -> None:
         self.tree = np.arange(tracks)
-        self.config, self.motion, self.gyro = config, motion, gyro
+        self.config, self.motion, self.noise = config, motion, noise
         self.at = 0.0
         self.anchored = 0.0
         self.loops = 0
         self.link: tuple[float, float, Array, Array] | None = None
 
-    def drift(self, d: float) -> tuple[float, float]:
-        """Standard deviations of position (m) and heading (rad) after `d` metres of dead reckoning."""
-        yaw = (0.3 if self.gyro else 1.0) * self.motion.yaw_distance * np.sqrt(d) + 1e-3
-        return float(np.hypot(2.0 * self.motion.along * d, yaw * d / np.sqrt(3)) + 0.05), float(yaw)
-
-    def advance(self, table: TrackTable, end: float, cap: float) -> bool:
-        """Go on towards distance `end`; True: a loop was closed that moves the estimate, solve before the next call.
+    def advance(self, table: TrackTable, way: Way, end: float, cap: float) -> bool:
+        """Go on along the `way` towards distance `end`; True: a loop was closed that moves the estimate, solve before the next call.
 
         `cap` bounds the drift where GNSS holds the path, m.
         """
         while self.at < end:
             self.at += self.config.window
-            if self._close(table, min(cap, 1e9)):
+            if self._close(table, way, min(cap, 1e6)):
                 return True
         return False
 
-    def _close(self, t: TrackTable, cap: float) -> bool:
+    def _close(self, t: TrackTable, way: Way, cap: float) -> bool:
         c = self.config
         mature = (t.hits >= 3) & (t.first <= self.at)
         now = mature & (t.last > self.at - c.recent)
@@ -86,31 +83,36 @@ class LoopCloser:
             return False
         recent_trees = np.unique(self.tree[now])
         is_recent = np.isin(self.tree, recent_trees)
-        held = is_recent & mature & (t.last < self.at - 2 * c.recent)
-        if held.any():
+        known = np.unique(self.tree[is_recent & mature & (t.last < self.at - 2 * c.recent)])
+        if len(np.intersect1d(known, self.tree[mature & (t.last > self.at - c.window)])) >= HOLDING:
             self.anchored = self.at
         old = mature & ~is_recent & (t.last < self.at - c.recent)
         if not old.any():
             return False
-        sigma, yaw_sigma = self.drift(max(self.at - self.anchored, c.window))
-        if sigma > cap:
-            sigma, yaw_sigma = cap, min(yaw_sigma, max(0.02, cap / 50.0))
         here, here_id, here_sigma = _centres(t, self.tree, now)
         there, there_id, there_sigma = _centres(t, self.tree, old)
-        bend = min(0.5 * self.drift(0.5 * c.recent)[0], 0.3 * cap)  # the piece itself is not quite rigid
+        centre = here.mean(0)
+        off = bounded(drift(way, min(self.anchored, self.at - c.window), self.at, centre, self.motion, self.noise), cap)
+        # The piece itself is not quite rigid.
+        within = drift(way, self.at - 0.5 * c.recent, self.at, centre, self.motion, self.noise)
+        bend = min(0.5 * deviation(within), 0.3 * cap)
         weight = c.mapped * (1.0 - np.exp(-_hits(t, self.tree, now) / 6.0))
-        result = lay(here, np.hypot(here_sigma, bend), there, there_sigma, sigma, yaw_sigma, c, weight)
-        if result is None:
+        seen_at = _mean(t, self.tree, now, np.maximum(0.5 * (t.first + t.last), self.at - c.recent))
+        apart = np.abs(seen_at[:, None] - seen_at) / (0.5 * c.recent)
+        here_cov = np.diag(here_sigma**2) + bend**2 * np.exp(-apart)
+        found = recognise(here, here_cov, there, there_sigma, off, c.margin, weight)
+        if found is None:
             return False
-        pairs, moved, move, centre = result
-        seen_again = np.isin(self.tree, there_id[[j for _, j in pairs]]) & old
+        seen_again = np.isin(self.tree, there_id[[j for _, j in found.pairs]]) & old
         # A small step the solver takes by itself.
-        self.link = (float(np.median(t.last[seen_again])), self.at, centre, move) if moved > 0.8 else None
-        for i, j in pairs:
+        self.link = (
+            (float(np.median(t.last[seen_again])), self.at, found.centre, found.move) if found.moved > 0.8 else None
+        )
+        for i, j in found.pairs:
             self.tree[self.tree == here_id[i]] = there_id[j]
         self.anchored = self.at
         self.loops += 1
-        return moved > 0.4
+        return found.moved > 0.4
 
 
 def moved_pose(pose: Array, centre: Array, move: Array) -> Array:
@@ -133,138 +135,120 @@ def _centres(
     return place, ids, np.bincount(index, w * t.sigma[chosen]) / total
 
 
+def _mean(t: TrackTable, tree: NDArray[np.int64], chosen: NDArray[np.bool_], x: Array) -> Array:
+    """Mean (K,), by sightings, of `x` (T,) over the chosen tracks of each tree, in the order of `_centres`."""
+    index = np.unique(tree[chosen], return_inverse=True)[1]
+    return np.asarray(np.bincount(index, t.hits[chosen] * x[chosen]) / np.bincount(index, t.hits[chosen]))
+
+
 def _hits(t: TrackTable, tree: NDArray[np.int64], chosen: NDArray[np.bool_]) -> Array:
     """Sightings (K,) of the trees that the chosen tracks belong to, in the order of `_centres`."""
     return np.bincount(np.unique(tree[chosen], return_inverse=True)[1], t.hits[chosen]).astype(float)
 
 
-def lay(
-    here: Array, here_sigma: Array, there: Array, there_sigma: Array, sigma: float, yaw_sigma: float, config: TreesConfig,
-    mapped: Array,
-) -> tuple[list[tuple[int, int]], float, Array, Array] | None:  # fmt: skip
-    """Pairs (i, j) of recent (N, 2) and old (M, 2) trees that are one, how far `here` moves (m), the move (x, y, yaw) and
-    the centre (2,) that it turns about; None: undecided.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recognised:
+    """Old ground: `pairs` (i, j) of recent and old trees that are one, the `move` (x, y, yaw) of the recent ones about their `centre` (2,), and how far it moves
+    one of them at most (`moved`, m)."""
 
-    `mapped` (N,) is the chance of each recent tree to be in the map if this is old ground.
+    pairs: list[tuple[int, int]]
+    move: Array
+    centre: Array
+    moved: float
+
+
+PLACES = PlacesConfig(
+    map_sigma=0.1, anchors=1e-3, bound=25.0, modes=60, felled=0.04, scales=(1.0, 1.5, 2.2), scale_prior=(0.9, 0.07, 0.03)
+)  # fmt: skip
+"""Trees of a map that is still being made lie 0.1 m beside their place, more where it is bent."""
+HOLDING = 3
+"""Trees of old ground that are in view hold the path: fewer leave its heading open."""
+AROUND, SHOWN = 2.0, 0.5
+"""m about a recent tree where an old one would have been seen again, and the chance of that."""
+PAIR = 25.0
+"""Longest pair of trees that a search begins with, m."""
+APART = 0.8
+"""Placements that put a corner of the piece further from each other are rivals, m."""
+
+
+def recognise(
+    here: Array, here_cov: Array, there: Array, there_sigma: Array, off: Array, margin: float, mapped: Array
+) -> Recognised | None:  # fmt: skip
+    """Are the trees `here` (N, 2) among those `there` (M, 2), given how far dead reckoning may be `off` (3, 3)? None: no, or undecided.
+
+    `here_cov` (N, N) is joint, per axis: the piece is not quite rigid, what was seen together hangs together. `mapped` (N,) is the chance of each recent tree to be in the map if this is old ground. The place search proposes; what the drift makes of it, how it compares
+    with its rivals, and with new ground, where all trees are new, is decided here: by `margin` nats.
     """
     centre = here.mean(0)
     arm = float(np.sqrt(np.mean(np.sum((here - centre) ** 2, axis=1)))) + 1.0
-    reach = 3.0 * sigma + 3.0 * yaw_sigma * arm + 1.0
+    reach = 3.0 * deviation(off) + 3.0 * float(np.sqrt(off[2, 2])) * arm + 1.0
     near = np.flatnonzero(cKDTree(here).query(there)[0] < reach)
-    if len(near) == 0:
+    if len(near) < 2:
         return None
-    target, target_sigma = there[near], there_sigma[near]
-    # Where dead reckoning is better than the trees are apart, there is one place to try.
-    moves = np.zeros((1, 3)) if sigma < 0.6 else _seeds(here, target, centre, sigma, yaw_sigma)
-    tree = cKDTree(target)
-    area = np.prod(np.ptp(np.concatenate([here, target]), axis=0) + 10.0)
-    density = max(len(target) / area, 1e-4)
-    scores = np.empty(len(moves))
-    found: list[list[tuple[int, int]]] = []
-    for k in range(len(moves)):
-        moves[k], scores[k], pairs = _settle(
-            moves[k], here, here_sigma, tree, target_sigma, centre, sigma, yaw_sigma, density, mapped
-        )
-        found.append(pairs)
-    best = int(np.argmax(scores))
-    if len(found[best]) == 0 or scores[best] < config.margin:
+    index = build_index(there[near], there_sigma[near] ** 2, np.full(len(near), np.nan), PAIR, PAIR, PLACES.map_sigma)
+    unknown = np.full(len(here), np.nan)
+    area = float(np.prod(np.ptp(np.concatenate([here, there[near]]), axis=0) + 10.0))
+    density = max(len(near) / area, 1e-4)  # of things, trees or not, that turn up anywhere
+    cov = np.asarray(np.kron(here_cov, np.eye(2)), float)
+    marks = Landmarks(
+        m=here - centre, cov=cov, var=spread(here - centre, cov), diameter=unknown, diameter_var=unknown,
+        tree=np.log(mapped / SHOWN), other=np.log((1.0 - mapped) * density), lasting=mapped,
+    )  # fmt: skip
+    found = search(marks, index, PLACES, Prior(np.array([*centre, 0.0]), off[:2, :2], float(np.sqrt(off[2, 2]))))
+    found = replace(found, pose=np.concatenate([[[*centre, 0.0]], found.pose]))  # dead reckoning's own place too
+    placed = placements(found, marks, *_looked_at(marks.m), index, PLACES)
+    if not len(placed):
         return None
-    corners = np.array([[0, 0], [arm, 0], [0, arm]]) + centre
-    ends = np.stack([_apply(m, corners, centre) for m in moves])
-    other = np.abs(ends - ends[best]).max(axis=(1, 2)) > 0.8
-    rival = max(float(scores[other].max(initial=-np.inf)), 0.0)
-    if scores[best] - rival < config.margin:
+    # Integrated over the pose: a normal of what the trees leave open and of the drift.
+    away = placed.pose - [*centre, 0.0]
+    away[:, 2] = (away[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    total = off + _in_map(np.asarray(np.linalg.inv(placed.information)), placed.pose[:, 2])
+    log = (
+        placed.log
+        - 0.5 * np.einsum("mi,mij,mj->m", away, np.linalg.inv(total), away)
+        - 0.5 * np.linalg.slogdet(2 * np.pi * total)[1]
+    )
+    # In a lattice a new tree stands where one of another place stands: to fit more trees there tells little.
+    variance = float(np.median(marks.var) + np.median(there_sigma[near] ** 2)) + PLACES.map_sigma**2
+    alike = max(0.0, float(np.log(np.median(mapped) / (2 * np.pi * (variance + 2.0 * index.jitter**2)) / density)))
+    among = log - alike * (placed.tree >= 0).sum(axis=1)
+    best = int(np.argmax(among))
+    corners = np.array([[0, 0], [arm, 0], [0, arm]])
+    ends = np.stack([planar_points(pose, corners) for pose in placed.pose])
+    rivals = among[np.abs(ends - ends[best]).max(axis=(1, 2)) > APART]
+    rest = among.min() + np.log(found.rest) if found.rest > 0 else -np.inf
+    new_ground = float(len(here) * np.log(density))
+    if min(log[best] - new_ground, among[best] - np.logaddexp.reduce([*rivals, rest, -np.inf])) < margin:
         return None
-    moved = float(np.abs(_apply(moves[best], here, centre) - here).max())
-    return [(i, int(near[j])) for i, j in found[best]], moved, moves[best], centre
+    move = off @ np.linalg.solve(total[best], away[best])  # as far as the drift allows
+    moved = float(np.abs(planar_points(move, here - centre) - (here - centre)).max())
+    rows = np.flatnonzero(placed.tree[best] >= 0)
+    pairs = [(int(i), int(near[placed.tree[best, i]])) for i in rows]
+    return Recognised(pairs=pairs, move=move, centre=centre, moved=moved)
 
 
-def _apply(move: Array, points: Array, centre: Array) -> Array:
-    c, s = np.cos(move[2]), np.sin(move[2])
-    d = points - centre
-    return np.asarray(np.stack([c * d[:, 0] - s * d[:, 1], s * d[:, 0] + c * d[:, 1]], axis=1) + centre + move[:2])
+def _in_map(cov: Array, yaw: Array) -> Array:
+    """Covariances (M, 3, 3) of poses in their own frames, turned into the map's."""
+    R = np.zeros((len(yaw), 3, 3))
+    R[:, 0, 0] = R[:, 1, 1] = np.cos(yaw)
+    R[:, 1, 0], R[:, 0, 1], R[:, 2, 2] = np.sin(yaw), -np.sin(yaw), 1.0
+    return np.asarray(R @ cov @ R.swapaxes(1, 2))
 
 
-def _seeds(here: Array, there: Array, centre: Array, sigma: float, yaw_sigma: float, most: int = 600) -> Array:
-    """Moves (K, 3): none, and those that lay a pair of recent trees onto a pair of old ones."""
-    moves = [np.zeros(3)]
-    n = len(here)
-    d = np.linalg.norm(here[:, None] - here[None], axis=2)
-    order = np.dstack(np.unravel_index(np.argsort(-d, axis=None), d.shape))[0]
-    order = order[(order[:, 0] < order[:, 1])]
-    useful = order[(d[order[:, 0], order[:, 1]] < 40.0)][:: max(1, len(order) // 24)][:24] if n > 1 else order[:0]
-    between = np.linalg.norm(there[:, None] - there[None], axis=2)
-    reach = 3.0 * sigma + 1.0
-    for a, b in useful:
-        length = d[a, b]
-        ja, jb = np.nonzero(np.abs(between - length) < 0.25 + 0.01 * length)
-        lever = 3.0 * yaw_sigma
-        close = (np.linalg.norm(there[ja] - here[a], axis=1) < reach + lever * np.linalg.norm(here[a] - centre)) & (
-            np.linalg.norm(there[jb] - here[b], axis=1) < reach + lever * np.linalg.norm(here[b] - centre)
-        )
-        for i, j in zip(ja[close].tolist(), jb[close].tolist(), strict=True):
-            u, v = here[b] - here[a], there[j] - there[i]
-            turn = float(np.arctan2(u[0] * v[1] - u[1] * v[0], u @ v))
-            if abs(turn) > 3.0 * yaw_sigma + 0.3 / length:
-                continue
-            middle = 0.5 * (here[a] + here[b])
-            c, s = np.cos(turn), np.sin(turn)
-            m = middle - centre
-            moved = np.array([c * m[0] - s * m[1], s * m[0] + c * m[1]]) + centre
-            moves.append(np.array([*(0.5 * (there[i] + there[j]) - moved), turn]))
-    out = np.array(moves)
-    inside = np.linalg.norm(out[:, :2], axis=1) < reach
-    out = out[inside]
-    # Many pairs vote for the same place: keep one of each, the most voted first.
-    if len(out) > 1:
-        keys = np.round(out / [0.5, 0.5, 0.03]).astype(int)
-        _, first, votes = np.unique(keys, axis=0, return_index=True, return_counts=True)
-        out = np.concatenate([out[:1], out[first[np.argsort(-votes)][:most]]])
-    return out
+def planar_points(pose: Array, points: Array) -> Array:
+    """Points (N, 2) turned and shifted by a pose (3,) x, y, yaw."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return np.asarray(points @ np.array([[c, s], [-s, c]]) + pose[:2])
 
 
-def _settle(
-    move: Array, here: Array, here_sigma: Array, tree: cKDTree, there_sigma: Array, centre: Array, sigma: float,
-    yaw_sigma: float, density: float, mapped: Array,
-) -> tuple[Array, float, list[tuple[int, int]]]:  # fmt: skip
-    """Refine a move by its own matches and weigh it: log-odds against clutter, and the prior of the drift."""
-    pairs: list[tuple[int, int]] = []
-    target = np.asarray(tree.data)
-    for gate in (1.5, 0.8, 0.5):
-        moved = _apply(move, here, centre)
-        distance, j = _nearest(tree, moved, gate)
-        pairs = _one_to_one(distance, j)
-        if len(pairs) < 2:
-            break
-        i_, j_ = np.array(pairs).T
-        x, y, turn = fit_rigid_2d(here[i_] - centre, target[j_] - centre)
-        move = np.array([x, y, turn])
-    moved = _apply(move, here, centre)
-    distance, j = _nearest(tree, moved, 1.5)
-    pairs = _one_to_one(distance, j)
-    score = -0.5 * float(move[:2] @ move[:2]) / sigma**2 - 0.5 * float(move[2] / yaw_sigma) ** 2
-    kept = []
-    for i, k in pairs:
-        variance = here_sigma[i] ** 2 + there_sigma[k] ** 2 + 0.1**2
-        gain = np.log(mapped[i] / (2 * np.pi * variance * density)) - 0.5 * distance[i] ** 2 / variance
-        if gain > np.log(1 - mapped[i]):
-            score += gain - np.log(1 - mapped[i])
-            kept.append((i, k))
-    score += float(np.log(1 - mapped).sum())
-    return move, score, kept
-
-
-def _nearest(tree: cKDTree, points: Array, most: float) -> tuple[Array, NDArray[np.intp]]:
-    distance, j = tree.query(points, distance_upper_bound=most)
-    return np.asarray(distance, float), np.asarray(j, np.intp)
-
-
-def _one_to_one(distance: Array, j: NDArray[np.intp]) -> list[tuple[int, int]]:
-    taken: dict[int, int] = {}
-    for i in np.argsort(distance).tolist():
-        if np.isfinite(distance[i]) and int(j[i]) not in taken:
-            taken[int(j[i])] = i
-    return [(i, k) for k, i in taken.items()]
+def _looked_at(m: Array) -> tuple[Array, Array]:
+    """Raster of looks (X, Y) and its origin (2,), as `places.placements` takes them: around the recent trees old ones would have been seen."""
+    low = np.floor(m.min(0) - AROUND - 1.0)
+    shape = np.ceil(m.max(0) + AROUND + 1.0 - low).astype(int)
+    x, y = np.meshgrid(low[0] + np.arange(shape[0]) + 0.5, low[1] + np.arange(shape[1]) + 0.5, indexing="ij")
+    away, _ = cKDTree(m).query(np.stack([x.ravel(), y.ravel()], axis=1))
+    looks = -np.log(1.0 - SHOWN / (1.0 - PLACES.felled))
+    return np.where(np.asarray(away).reshape(x.shape) < AROUND, looks, 0.0), low
 
 
 def tabulate(detections: Detections, track: NDArray[np.int64], map_T_scan: Array, distance: Array) -> TrackTable:

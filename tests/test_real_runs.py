@@ -36,6 +36,20 @@ def test_victoria_park(shared: Path) -> None:
 
 
 @pytest.mark.slow
+def test_victoria_park_without_a_fix_is_the_same_park(shared: Path) -> None:
+    """2.1 km of a car's wheels, 70 m off by themselves: trees alone close the loops, and path and trees come out as with the fixes."""
+    run = read_run([shared / "victoria_park_first_half.bag"], Config())
+    with_fixes = solve_run(run, Config(), check_fixes=2)
+    s = solve_run(read_run([shared / "victoria_park_first_half.bag"], Config()), Config(), check_fixes=1)
+    assert s.problem.datum is None
+    own, theirs = s.estimate.map_T_robot[:, :3, 3], with_fixes.estimate
+    at = interpolate(theirs.stamps_ns, theirs.map_T_robot, s.estimate.stamps_ns)[:, :3, 3]
+    off = np.hypot(*(transform(align_se3(own, at), own) - at)[:, :2].T)
+    assert off.max() < 1.0
+    assert abs(len(s.existence.ok) - len(with_fixes.existence.ok)) <= 6
+
+
+@pytest.mark.slow
 def test_forest_is_found_again(shared: Path) -> None:
     """Real trees in a forest: mapped in the first 240 s, the rest localized in that map; no pose is far from the reference."""
     bag = shared / "evo_forest"

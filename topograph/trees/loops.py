@@ -161,6 +161,8 @@ PLACES = PlacesConfig(
     map_sigma=0.1, anchors=1e-3, bound=25.0, modes=60, felled=0.04, scales=(1.0, 1.5, 2.2), scale_prior=(0.9, 0.07, 0.03)
 )  # fmt: skip
 """Trees of a map that is still being made lie 0.1 m beside their place, more where it is bent."""
+RIVAL = 1.5
+"""Of the margin over new ground, that over another place on old ground: a wrong row bends the map, and wheels may be worse than they are said to be."""
 HOLDING = 3
 """Trees of old ground that are in view hold the path: fewer leave its heading open."""
 AROUND, SHOWN = 2.0, 0.5
@@ -218,7 +220,8 @@ def recognise(
     rivals = among[np.abs(ends - ends[best]).max(axis=(1, 2)) > APART]
     rest = among.min() + np.log(found.rest) if found.rest > 0 else -np.inf
     new_ground = float(len(here) * np.log(density))
-    if min(log[best] - new_ground, among[best] - np.logaddexp.reduce([*rivals, rest, -np.inf])) < margin:
+    surer = float(among[best] - np.logaddexp.reduce([*rivals, rest, -np.inf]))
+    if log[best] - new_ground < margin or surer < RIVAL * margin:
         return None
     move = off @ np.linalg.solve(total[best], away[best])  # as far as the drift allows
     moved = float(np.abs(planar_points(move, here - centre) - (here - centre)).max())

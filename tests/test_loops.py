@@ -1,0 +1,202 @@
+"""Loops that trees close: the drift's covariance against a sampled one, the place search under a prior, and what is decided."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from topograph.geometry import Array, planar, transform
+from topograph.motion import Motion, MotionConfig
+from topograph.places import Landmarks, PlacesConfig, Prior, build_index, search
+from topograph.trees.drift import Way, bounded, deviation, drift
+from topograph.trees.loops import Recognised, moved_pose, recognise
+
+seeds = st.integers(0, 2**32 - 1)
+PLACES = PlacesConfig(
+    map_sigma=0.05, anchors=1e-3, bound=25.0, modes=100, felled=0.04, scales=(1.0,), scale_prior=(1.0,)
+)
+
+
+def motion_of(distance: Array, *, gyro: bool) -> Motion:
+    n = len(distance)
+    stamps = np.arange(n) * 10**9
+    return Motion(
+        stamps_ns=stamps, odom_T_robot=np.tile(np.eye(4), (n, 1, 1)), distance=distance, turned=np.zeros(n), gyro=gyro, wheels=True
+    )  # fmt: skip
+
+
+def u_turn() -> tuple[Array, Array]:
+    """Distances (K,) and poses (K, 3): 30 m out, a half circle of 3 m, 30 m back, every half metre."""
+    turn = np.linspace(0.0, np.pi, 20)[1:]
+    out = np.arange(0.0, 30.0, 0.5)
+    pose = np.concatenate(
+        [
+            np.column_stack([out, 0 * out, 0 * out]),
+            np.column_stack([30 + 3 * np.sin(turn), 3 - 3 * np.cos(turn), turn]),
+            np.column_stack([30 - out[1:], 6 + 0 * out[1:], np.pi + 0 * out[1:]]),
+        ]
+    )
+    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T))]), pose
+
+
+def test_the_drift_is_that_of_ways_driven_with_wrong_scales() -> None:
+    """The same way with the wheels' scale, the turns' scale and the straight wrong, many times: their spread is the stated one."""
+    distance, pose = u_turn()
+    noise = MotionConfig(along=0.005, yaw_wheels=0.02, yaw_distance=1e-6)
+    centre = np.array([10.0, 8.0])
+    stated = drift(
+        Way(distance=distance, pose=pose), 0.0, float(distance[-1]), centre, motion_of(distance, gyro=False), noise
+    )
+    rng = np.random.default_rng(0)
+    step, turn, d = np.diff(pose[:, :2], axis=0), np.diff(pose[:, 2]), np.diff(distance)
+    ends = []
+    for _ in range(4000):
+        longer, wider, bend = 0.01 * rng.normal(), 0.02 * rng.normal(), 1e-3 * rng.normal()
+        yaw = np.concatenate([[0.0], np.cumsum(wider * turn + bend * d)])
+        c, s = np.cos(0.5 * (yaw[1:] + yaw[:-1])), np.sin(0.5 * (yaw[1:] + yaw[:-1]))
+        at = (1 + longer) * np.stack([c * step[:, 0] - s * step[:, 1], s * step[:, 0] + c * step[:, 1]]).sum(axis=1)
+        arm = centre - pose[-1, :2]  # the piece rides on the last pose
+        c, s = np.cos(yaw[-1]), np.sin(yaw[-1])
+        there = at + pose[0, :2] + [c * arm[0] - s * arm[1], s * arm[0] + c * arm[1]]
+        ends.append([*(there - centre), yaw[-1]])
+    sampled = np.cov(np.array(ends).T)
+    slips = 0.01**2 * 10.0 * distance[-1] + 0.05**2
+    np.testing.assert_allclose(stated - np.diag([slips, slips, 1e-6]), sampled, rtol=0.1, atol=2e-3)
+
+
+def test_a_drift_is_bounded_by_what_holds_the_path() -> None:
+    distance, pose = u_turn()
+    free = drift(
+        Way(distance=distance, pose=pose),
+        0.0,
+        60.0,
+        np.array([5.0, 6.0]),
+        motion_of(distance, gyro=False),
+        MotionConfig(),
+    )
+    held = bounded(free, 0.5)
+    assert deviation(free) > 1.0
+    assert deviation(held) <= 0.5
+    assert np.sqrt(held[2, 2]) <= 0.02
+    np.testing.assert_allclose(bounded(free, 1e6)[:2, :2], free[:2, :2], rtol=1e-3)
+
+
+def lattice(rng: np.random.Generator, jitter: float, n: int = 12) -> Array:
+    """(n * n, 2) trees, 5 m apart."""
+    grid = np.stack(np.meshgrid(np.arange(n) * 5.0, np.arange(n) * 5.0), axis=2).reshape(-1, 2)
+    return grid + jitter * rng.normal(size=grid.shape)
+
+
+def test_a_prior_picks_among_places_that_are_alike() -> None:
+    """In a perfect lattice every step of it fits: with a prior, what lies within it comes first, and what lies far off not at all."""
+    trees = lattice(np.random.default_rng(0), 0.0)
+    index = build_index(trees, np.full(len(trees), 1e-4), np.full(len(trees), np.nan), 25.0, 16.0, 0.05)
+    at = np.array([22.0, 27.0, 0.0])
+    m = trees[np.hypot(*(trees - at[:2]).T) < 8.0] - at[:2]
+    n = len(m)
+    marks = Landmarks(
+        m=m, cov=1e-3 * np.eye(2 * n), var=np.full(n, 1e-3), diameter=np.full(n, np.nan), diameter_var=np.full(n, np.nan),
+        tree=np.full(n, np.log(0.9)), other=np.full(n, np.log(0.1 * index.density)), lasting=np.full(n, 0.9),
+    )  # fmt: skip
+    free = search(marks, index, PLACES)
+    assert len(free.pose) > 50
+    held = search(marks, index, PLACES, Prior(at + [0.3, -0.2, 0.01], np.diag([0.25, 0.25]), 0.05))
+    np.testing.assert_allclose(held.pose[0], at, atol=0.05)
+    assert np.hypot(*(held.pose[:, :2] - at[:2]).T).max() < 4.0
+    # A prior that is wide across and narrow along lets through what lies across.
+    wide = search(marks, index, PLACES, Prior(at, np.diag([0.01, 100.0]), 0.05))
+    off = wide.pose[:, :2] - at[:2]
+    assert np.abs(off[:, 0]).max() < 1.0
+    assert np.abs(off[:, 1]).max() > 4.0
+
+
+def seen_again(
+    rng: np.random.Generator, trees: Array, drifted: Array, fresh: int = 2, sigma: float = 0.05
+) -> tuple[Recognised | None, Array, Array]:
+    """What `recognise` says of the trees of a corner, moved by `drifted` about their centre, with `fresh` new ones; here (N, 2) and their trees (N,)."""
+    rows = np.flatnonzero((trees[:, 0] < 17.0) & (trees[:, 1] < 17.0))
+    true = np.concatenate([trees[rows], rng.uniform(0, 17, (fresh, 2))])
+    centre = true.mean(0)
+    T = moved_pose(np.eye(4), centre, -drifted)
+    here = transform(T, np.column_stack([true, np.zeros(len(true))]))[:, :2] + sigma * rng.normal(size=true.shape)
+    off = np.diag([2.0**2, 2.0**2, 0.1**2])
+    found = recognise(
+        here, sigma**2 * np.eye(len(here)), trees, np.full(len(trees), sigma), off, 7.0, np.full(len(here), 0.5)
+    )
+    return found, here, np.concatenate([rows, np.full(fresh, -1)])
+
+
+@given(seeds, st.floats(-2.5, 2.5), st.floats(-2.5, 2.5), st.floats(-0.15, 0.15))
+@settings(max_examples=20, deadline=None)
+def test_scattered_trees_are_recognised_and_put_back(seed: int, x: float, y: float, yaw: float) -> None:
+    rng = np.random.default_rng(seed)
+    trees = lattice(rng, 1.3, 8)
+    found, here, is_tree = seen_again(rng, trees, np.array([x, y, yaw]))
+    if found is None:  # undecided is allowed, wrong is not
+        return
+    assert sum(is_tree[i] == j for i, j in found.pairs) >= len(found.pairs) - 1
+    back = transform(moved_pose(np.eye(4), found.centre, found.move), np.column_stack([here, np.zeros(len(here))]))[
+        :, :2
+    ]
+    i, j = np.array([(i, j) for i, j in found.pairs if is_tree[i] >= 0]).T
+    assert np.linalg.norm(back[i] - trees[j], axis=1).mean() < 0.3
+
+
+def test_scattered_trees_are_recognised_nearly_always() -> None:
+    rng = np.random.default_rng(1)
+    found = [seen_again(rng, lattice(rng, 1.3, 8), rng.normal(0, [1.5, 1.5, 0.07]))[0] for _ in range(30)]
+    assert sum(f is not None for f in found) >= 28
+
+
+def test_a_lattice_is_left_undecided() -> None:
+    """Steps of the lattice are as good as each other; the drift of 2 m cannot tell two rows that are 5 m apart surely enough."""
+    rng = np.random.default_rng(2)
+    wrong = 0
+    for _ in range(30):
+        found, _, is_tree = seen_again(rng, lattice(rng, 0.02, 8), rng.normal(0, [2.0, 2.0, 0.05]))
+        wrong += found is not None and sum(is_tree[i] == j for i, j in found.pairs) < len(found.pairs) - 1
+    assert wrong == 0
+
+
+def test_trees_that_are_not_there_are_not_recognised() -> None:
+    rng = np.random.default_rng(3)
+    trees = lattice(rng, 1.3, 8)
+    for _ in range(20):
+        here = rng.uniform(0, 20, (14, 2))
+        off = np.diag([2.0**2, 2.0**2, 0.1**2])
+        got = recognise(here, 0.0025 * np.eye(14), trees, np.full(len(trees), 0.05), off, 7.0, np.full(14, 0.5))
+        assert got is None
+
+
+def test_a_piece_that_is_bent_is_recognised_where_its_parts_hang_together() -> None:
+    """Half of the piece is 0.5 m off: as errors of each tree by itself that says little, as one of a half it says where it is."""
+    rng = np.random.default_rng(4)
+    trees = lattice(rng, 1.3, 8)
+    corner = trees[(trees < 12.0).all(axis=1)]
+    here = np.asarray(corner + 0.03 * rng.normal(size=corner.shape))
+    late = here[:, 0] > 6.0
+    here[late] += [0.4, -0.3]
+    n, bend = len(here), 0.7
+    off = np.diag([2.0**2, 2.0**2, 0.1**2])
+    together = 0.0025 * np.eye(n) + bend**2 * (late[:, None] == late)
+    alone = (0.0025 + bend**2) * np.eye(n)
+    few = np.full(n, 0.5)
+    assert recognise(here, together, trees, np.full(len(trees), 0.05), off, 14.0, few) is not None
+    assert recognise(here, alone, trees, np.full(len(trees), 0.05), off, 14.0, few) is None
+
+
+def test_a_move_is_taken_about_its_centre() -> None:
+    pose = planar(3.0, 4.0, 0.2)
+    got = moved_pose(pose, np.array([1.0, 4.0]), np.array([10.0, -1.0, np.pi / 2]))
+    np.testing.assert_allclose(got, planar(11.0, 5.0, 0.2 + np.pi / 2), atol=1e-12)
+
+
+def test_the_way_is_read_between_its_poses() -> None:
+    distance, pose = u_turn()
+    poses = np.array([planar(*p) for p in pose])
+    way = Way.of(distance, poses)
+    np.testing.assert_allclose(way.pose, pose, atol=1e-9)
+    assert way.at(np.array([0.25]))[0] == pytest.approx([0.25, 0.0, 0.0])
+    assert replace(way, pose=way.pose + 1.0).at(np.array([0.0]))[0] == pytest.approx([1.0, 1.0, 1.0])

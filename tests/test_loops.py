@@ -11,7 +11,7 @@ from topograph.geometry import Array, planar, transform
 from topograph.motion import Motion, MotionConfig
 from topograph.places import Landmarks, PlacesConfig, Prior, build_index, search
 from topograph.trees.drift import Way, bounded, deviation, drift
-from topograph.trees.loops import Recognised, moved_pose, recognise
+from topograph.trees.loops import Closed, Recognised, moved_pose, recognise
 
 seeds = st.integers(0, 2**32 - 1)
 PLACES = PlacesConfig(
@@ -200,3 +200,15 @@ def test_the_way_is_read_between_its_poses() -> None:
     np.testing.assert_allclose(way.pose, pose, atol=1e-9)
     assert way.at(np.array([0.25]))[0] == pytest.approx([0.25, 0.0, 0.0])
     assert replace(way, pose=way.pose + 1.0).at(np.array([0.0]))[0] == pytest.approx([1.0, 1.0, 1.0])
+
+
+def test_a_loop_is_shut_over_the_way_since() -> None:
+    distance, pose = u_turn()
+    poses = np.array([planar(*p) for p in pose])
+    loop = Closed(before=5.0, since=20.0, now=50.0, centre=np.array([10.0, 6.0]), move=np.array([2.0, -1.0, 0.3]))
+    got = loop.bent(distance, poses)
+    early, late = distance <= 20.0, distance >= 50.0
+    np.testing.assert_array_equal(got[early], poses[early])
+    np.testing.assert_allclose(got[late], [moved_pose(T, loop.centre, loop.move) for T in poses[late]])
+    steps = np.linalg.norm(np.diff(got[:, :2, 3], axis=0), axis=1)
+    assert steps.max() < 1.0  # nothing is torn

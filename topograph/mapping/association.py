@@ -82,15 +82,18 @@ class Association:
         """The path as estimated."""
         return Way.of(self.problem.motion.distance_at(e.stamps_ns), e.map_T_robot)
 
+    def shut(self, e: Estimate) -> Estimate:
+        """An estimate with the loop that was just closed."""
+        loop = self.closer.closed
+        if loop is None:
+            return self.solve(e)
+        start = loop.bent(self.problem.motion.distance_at(e.stamps_ns), e.map_T_robot)
+        return self.solve(replace(e, map_T_robot=start), link=_link(self.problem, e, self.closer))
+
     def solve(self, e: Estimate, *, least: int = 3, patient: bool = False, link: Link | None = None) -> Estimate:
         """An estimate without covariances of the trees as they are now; `patient`: until it has converged."""
         if link is not None:  # pull the loop shut with the trees as they were, then join them
-            e = graph.solve(
-                replace(self.problem, start=e.map_T_robot, link=link),
-                self.config.estimate,
-                quick=True,
-                patient=True,
-            )
+            e = graph.solve(replace(self.problem, start=e.map_T_robot, link=link), self.config.estimate, quick=True)
         self.problem, _, _ = self.with_trees(self.tree_of_track, least)
         self.problem = replace(self.problem, start=e.map_T_robot)
         return graph.solve(self.problem, self.config.estimate, quick=True, patient=patient)
@@ -167,7 +170,7 @@ def associate_and_solve(
     while a.closer.advance(a.table(estimate), a.way(estimate), end, cap):
         progress("associate", min(1.0, a.closer.at / max(end, 1e-9)))
         a.tree_of_track = a.closer.tree
-        estimate = a.solve(estimate, link=_link(problem, estimate, a.closer))
+        estimate = a.shut(estimate)
     progress("associate", 1.0)
     a.tree_of_track = a.named(a.closer.tree)
     estimate = a.solve(estimate, patient=True)
@@ -213,15 +216,15 @@ SETTLED = 0.01
 
 def _link(problem: Problem, estimate: Estimate, closer: LoopCloser) -> Link | None:
     """The loop just closed as one relative pose: it pulls the path over distances at which robust losses let go."""
-    if closer.link is None:
+    loop = closer.closed
+    if loop is None:
         return None
-    before, now, centre, move = closer.link
     distance = problem.motion.distance_at(problem.stamps_ns)
-    a, b = (int(np.clip(np.searchsorted(distance, d), 0, len(distance) - 1)) for d in (before, now))
+    a, b = (int(np.clip(np.searchsorted(distance, d), 0, len(distance) - 1)) for d in (loop.before, loop.now))
     if a == b:
         return None
     poses = estimate.map_T_robot
-    return Link(a, b, inverse(poses[a]) @ moved_pose(poses[b], centre, move))
+    return Link(a, b, inverse(poses[a]) @ moved_pose(poses[b], loop.centre, loop.move))
 
 
 def _gnss_cap(problem: Problem, way: Way, config: MappingConfig) -> float:

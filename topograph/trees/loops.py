@@ -45,6 +45,23 @@ class TrackTable:
     hits: NDArray[np.int64]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Closed:
+    """A loop: what was seen `before` is seen again `now`; dead reckoning has gone astray `since` (distances driven, m). The new piece turns about
+    `centre` (2,) and shifts by `move` (x, y, yaw)."""
+
+    before: float
+    since: float
+    now: float
+    centre: Array
+    move: Array
+
+    def bent(self, distance: Array, map_T_robot: Array) -> Array:
+        """Poses (K, 4, 4) after `distance` (K,) m with the loop shut: what went astray is spread over the way since."""
+        share = np.clip((distance - self.since) / max(self.now - self.since, 1e-9), 0.0, 1.0)
+        return np.array([moved_pose(T, self.centre, k * self.move) for k, T in zip(share, map_T_robot, strict=True)])
+
+
 class LoopCloser:
     """Walks along the run once; `advance` goes on until a loop moves the map, then waits for a new estimate.
 
@@ -52,8 +69,7 @@ class LoopCloser:
         tree: (T,) tree of each track; equal numbers are one tree.
         anchored: distance driven when old ground was last recognised, m.
         loops: loops closed so far.
-        link: the last loop: distances driven when the old and the new piece were seen, the centre (2,) about which
-            the new piece turns, and its move (x, y, yaw); see `moved_pose`.
+        closed: the last loop, None where it moved nothing by much.
     """
 
     def __init__(self, tracks: int, motion: Motion, config: TreesConfig, noise: MotionConfig) -> None:
@@ -62,7 +78,7 @@ class LoopCloser:
         self.at = 0.0
         self.anchored = 0.0
         self.loops = 0
-        self.link: tuple[float, float, Array, Array] | None = None
+        self.closed: Closed | None = None
 
     def advance(self, table: TrackTable, way: Way, end: float, cap: float) -> bool:
         """Go on along the `way` towards distance `end`; True: a loop was closed that moves the estimate, solve before the next call.
@@ -104,10 +120,10 @@ class LoopCloser:
         if found is None:
             return False
         seen_again = np.isin(self.tree, there_id[[j for _, j in found.pairs]]) & old
-        # A small step the solver takes by itself.
-        self.link = (
-            (float(np.median(t.last[seen_again])), self.at, found.centre, found.move) if found.moved > 0.8 else None
-        )
+        self.closed = None  # a small step the solver takes by itself
+        if found.moved > 0.8:
+            before = float(np.median(t.last[seen_again]))
+            self.closed = Closed(before=before, since=self.anchored, now=self.at, centre=found.centre, move=found.move)
         for i, j in found.pairs:
             self.tree[self.tree == here_id[i]] = there_id[j]
         self.anchored = self.at

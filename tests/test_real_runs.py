@@ -8,6 +8,7 @@ import pytest
 from topograph.config import Config
 from topograph.evaluate import read_tum
 from topograph.geometry import align_se3, interpolate, transform
+from topograph.mapping import Solved
 from topograph.pipeline import localize_bags, read_run, residual_metrics, solve_run, topo_map, why_no_trees
 
 
@@ -21,11 +22,16 @@ def test_husky_without_lidar(shared: Path) -> None:
     assert got["held-out fixes RMS"] < 3.0  # the receiver states 0.8 to 1.7 m
 
 
+@pytest.fixture(scope="module")
+def park(shared: Path) -> Solved:
+    """Victoria Park, every second fix withheld."""
+    return solve_run(read_run([shared / "victoria_park_first_half.bag"], Config()), Config(), check_fixes=2)
+
+
 @pytest.mark.slow
-def test_victoria_park(shared: Path) -> None:
+def test_victoria_park(park: Solved) -> None:
     """A car in a park: real trunks, not associated, with false ones among them; GPS with gaps and jumps."""
-    run = read_run([shared / "victoria_park_first_half.bag"], Config())
-    s = solve_run(run, Config(), check_fixes=2)
+    s = park
     got = {m.name: m.value for m in residual_metrics(s)}
     assert got["held-out fixes RMS"] < 3.0
     assert got["trunk residual median"] < 0.15
@@ -36,17 +42,15 @@ def test_victoria_park(shared: Path) -> None:
 
 
 @pytest.mark.slow
-def test_victoria_park_without_a_fix_is_the_same_park(shared: Path) -> None:
+def test_victoria_park_without_a_fix_is_the_same_park(shared: Path, park: Solved) -> None:
     """2.1 km of a car's wheels, 70 m off by themselves: trees alone close the loops, and path and trees come out as with the fixes."""
-    run = read_run([shared / "victoria_park_first_half.bag"], Config())
-    with_fixes = solve_run(run, Config(), check_fixes=2)
     s = solve_run(read_run([shared / "victoria_park_first_half.bag"], Config()), Config(), check_fixes=1)
     assert s.problem.datum is None
-    own, theirs = s.estimate.map_T_robot[:, :3, 3], with_fixes.estimate
+    own, theirs = s.estimate.map_T_robot[:, :3, 3], park.estimate
     at = interpolate(theirs.stamps_ns, theirs.map_T_robot, s.estimate.stamps_ns)[:, :3, 3]
     off = np.hypot(*(transform(align_se3(own, at), own) - at)[:, :2].T)
     assert off.max() < 1.0
-    assert abs(len(s.existence.ok) - len(with_fixes.existence.ok)) <= 6
+    assert abs(len(s.existence.ok) - len(park.existence.ok)) <= 6
 
 
 @pytest.mark.slow

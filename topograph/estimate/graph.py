@@ -112,6 +112,7 @@ def _solve(problem: Problem, config: EstimateConfig, *, quick: bool, patient: bo
         values = optimised(graph_of(problem, last, config, inert), values, config.iterations)
     values, linear = with_big_stack(lambda: _polish(problem, last, config, inert, values))
     out = _estimate(problem, config, values, last, linear, time.perf_counter() - began)
+    del linear  # as large as the graph: the tests make one of their own
     try:
         tested = with_big_stack(lambda: _tested(problem, last, config, inert, values))
     except (RuntimeError, IndexError, np.linalg.LinAlgError):  # the estimate stands without them

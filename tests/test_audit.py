@@ -137,6 +137,14 @@ def test_trees_that_stand_twice_are_counted() -> None:
     assert audit.twice(np.concatenate([grid, grid[:8] + 0.4])) == pytest.approx(16 / 38)
 
 
+def test_a_lattice_that_was_laid_onto_itself_from_afar_is_doubted() -> None:
+    (found,) = audit.rows(2.8)
+    assert (found.name, found.refuses) == ("rows", False)
+    assert "2.8 spacings" in found.sentence
+    assert not list(audit.rows(0.3))
+    assert not list(audit.rows(0.0))
+
+
 def test_trees_that_may_be_posts_are_doubted() -> None:
     """In a recorded street half of the "trees" are masts and pillars, with probabilities of 0.6 to 0.98."""
     nan = float("nan")

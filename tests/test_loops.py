@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from topograph.geometry import Array, planar, transform
 from topograph.motion import Motion, MotionConfig
 from topograph.places import Landmarks, PlacesConfig, Prior, build_index, search
+from topograph.trees import TreesConfig
 from topograph.trees.drift import Way, bounded, deviation, drift
-from topograph.trees.loops import Closed, Recognised, moved_pose, recognise
+from topograph.trees.loops import Closed, LoopCloser, Recognised, TrackTable, moved_pose, recognise
 
 seeds = st.integers(0, 2**32 - 1)
 PLACES = PlacesConfig(
@@ -212,3 +213,109 @@ def test_a_loop_is_shut_over_the_way_since() -> None:
     np.testing.assert_allclose(got[late], [moved_pose(T, loop.centre, loop.move) for T in poses[late]])
     longer = np.linalg.norm(np.diff(got[:, :2, 3], axis=0), axis=1) - np.diff(distance)
     assert np.abs(longer).max() < 0.2  # nothing is torn
+
+
+def alley(rng: np.random.Generator, first: int, rows: int, gap: float, jitter: float) -> Array:
+    """(N, 2) trees of some rows along x, 12 in a row, from the row number `first` on."""
+    x, y = np.meshgrid(np.arange(12) * gap, np.arange(first, first + rows) * gap)
+    trees = np.column_stack([x.ravel(), y.ravel()])
+    return trees + jitter * rng.normal(size=trees.shape)
+
+
+def test_the_next_rows_of_a_lattice_are_not_taken_for_the_last() -> None:
+    """Two rows are mapped, the two beyond are new: with a drift of a spacing they would fit, tree by tree."""
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        there, here = alley(rng, 0, 2, 5.0, 0.03), alley(rng, 2, 2, 5.0, 0.03)[2:20]
+        off = np.diag([3.0**2, 3.0**2, 0.05**2])
+        assert (
+            recognise(
+                here, 0.0025 * np.eye(len(here)), there, np.full(len(there), 0.05), off, 7.0, np.full(len(here), 0.6)
+            )
+            is None
+        )
+
+
+def test_a_lattice_is_recognised_where_dead_reckoning_knows_the_row() -> None:
+    rng = np.random.default_rng(6)
+    for _ in range(10):
+        there = alley(rng, 0, 3, 5.0, 0.03)
+        here = there[4:24] + [0.2, -0.15] + 0.03 * rng.normal(size=(20, 2))
+        off = np.diag([0.3**2, 0.3**2, 0.01**2])
+        found = recognise(here, 0.0025 * np.eye(20), there, np.full(len(there), 0.05), off, 7.0, np.full(20, 0.6))
+        assert found is not None
+        assert found.pairs == [(i, i + 4) for i in range(20)]
+        np.testing.assert_allclose(found.move[:2], [-0.2, 0.15], atol=0.06)
+        assert 0.0 < found.slid < 0.1
+
+
+def test_what_is_turned_and_shifted_together_is_put_back_by_a_drift_that_says_so() -> None:
+    """An error of yaw far away shifts and turns the piece at once: a prior with that correlation lets it through, its mirror image does not."""
+    rng = np.random.default_rng(7)
+    trees = lattice(rng, 1.3, 8)
+    centre, yaw = trees[(trees < 17.0).all(axis=1)].mean(0), 0.08
+    shift = np.array([-60.0 * yaw, 0.0])  # the turn was 60 m below
+    T = moved_pose(np.eye(4), centre, -np.array([*shift, yaw]))
+    corner = trees[(trees < 17.0).all(axis=1)]
+    here = transform(T, np.column_stack([corner, np.zeros(len(corner))]))[:, :2]
+    arm = np.array([-60.0, 0.0, 1.0])
+    few, sigma = np.full(len(here), 0.5), np.full(len(trees), 0.05)
+    small = np.diag([0.1**2, 0.1**2, 0.003**2])
+    right = recognise(here, 0.0025 * np.eye(len(here)), trees, sigma, 0.08**2 * np.outer(arm, arm) + small, 7.0, few)
+    assert right is not None
+    np.testing.assert_allclose(right.move, [*shift, yaw], atol=0.1)
+    arm[2] = -1.0
+    wrong = recognise(here, 0.0025 * np.eye(len(here)), trees, sigma, 0.08**2 * np.outer(arm, arm) + small, 7.0, few)
+    assert wrong is None
+
+
+def walked(jitter: float, drifted: Array) -> tuple[LoopCloser, Array]:
+    """A closer at the end of the U-turn's way, tracks of both ways seen; the second way's are off by `drifted`; and the tree of each track."""
+    rng = np.random.default_rng(8)
+    distance, pose = u_turn()
+    trees = lattice(rng, jitter, 9) - [5.0, 12.0]
+    tracks, whose = [], []
+    for half in (distance <= 30.0, distance > 38.0):
+        for k, tree in enumerate(trees):
+            near = half & (np.hypot(*(pose[:, :2] - tree).T) < 8.0)
+            if near.sum() >= 3:
+                off = drifted if half[-1] else np.zeros(2)
+                tracks.append(
+                    [*(tree + off + 0.03 * rng.normal(size=2)), distance[near].min(), distance[near].max(), near.sum()]
+                )
+                whose.append(k)
+    x, y, first, last, hits = np.array(tracks).T
+    n = len(x)
+    place = np.column_stack([x, y])
+    table = TrackTable(
+        place=place, foot=place, width=np.zeros(n), post=np.zeros(n), sigma=np.full(n, 0.05), first=first, last=last, hits=hits.astype(np.int64)
+    )  # fmt: skip
+    closer = LoopCloser(n, motion_of(distance, gyro=False), TreesConfig(), MotionConfig())
+    while closer.advance(table, Way(distance=distance, pose=pose), float(distance[-1]), 1e6):
+        pass
+    return closer, np.array(whose)
+
+
+def test_a_walk_to_and_fro_closes_its_loop() -> None:
+    closer, whose = walked(1.2, np.array([0.5, -1.2]))
+    assert closer.loops >= 1
+    assert closer.closed is not None
+    np.testing.assert_allclose(closer.closed.move[:2], [-0.5, 1.2], atol=0.25)
+    assert closer.closed.since < closer.closed.now
+    for tree in np.unique(closer.tree):
+        assert len(set(whose[closer.tree == tree].tolist())) == 1  # no two trees have become one
+
+
+def test_a_drift_knows_of_slips_and_of_gaps_of_the_gyro() -> None:
+    distance, pose = u_turn()
+    way, centre = Way(distance=distance, pose=pose), np.array([5.0, 6.0])
+    good = motion_of(distance, gyro=True)
+    blind = replace(good, unseen=np.where(distance > 35.0, np.pi, 0.0))
+    slipped = replace(good, doubt=np.where(distance > 20.0, 1.5, 0.0))
+    end = float(distance[-1])
+    plain, gap, slip = (drift(way, 0.0, end, centre, m, MotionConfig()) for m in (good, blind, slipped))
+    assert np.sqrt(gap[2, 2]) == pytest.approx(0.08 * np.pi, rel=0.05)
+    assert deviation(gap) > 4.0
+    np.testing.assert_allclose(slip - plain, np.diag([2.25, 2.25, 0.0]), atol=1e-9)
+    assert np.sqrt(plain[2, 2]) < 0.03  # with a gyro; by the wheels, ten times that
+    assert np.sqrt(drift(way, 0.0, end, centre, motion_of(distance, gyro=False), MotionConfig())[2, 2]) > 0.2

@@ -307,19 +307,33 @@ def seldom(scans: int, with_trees: int) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def unsure(probability: Array) -> Iterator[Finding]:
-    """Are the trees trees? `probability` (T,) of that kind of each node that is called a tree, NaN where the source tells none."""
-    told = probability[np.isfinite(probability)]
-    half = int((told < HALF_SURE).sum())
-    if half >= FEW_TREES and half > UNSURE * len(told):
+def rows(slid: float) -> Iterator[Finding]:
+    """Was a loop closed by much in a planting as regular as its trees are known? By `slid` spacings."""
+    if slid > SLID:
         yield Finding(
-            name="kinds", value=half / len(told), bound=UNSURE, unit="",
-            sentence=f"{half} of {len(told)} nodes that are called trees may be posts, pillars or corners of houses: what is here is unlike what the trunk "
-            f"score was trained on; believe those with kind_probability above {HALF_SURE} rather than the others",
+            name="rows", value=slid, bound=SLID, unit="",
+            sentence=f"the run was laid onto itself over {slid:.1f} spacings of a regular planting, which looks the same from every row: it may be off by whole "
+            "rows; an IMU or GNSS tells which",
         )  # fmt: skip
 
 
-HALF_SURE, UNSURE, FEW_TREES = 0.9, 0.25, 4
+SLID = 0.5
+"""Of the spacing: beyond half of it the next row was nearer."""
+
+
+def unsure(probability: Array) -> Iterator[Finding]:
+    """Are the trees trees? `probability` (T,) of that kind of each node that is called a tree, NaN where the source tells none."""
+    told = probability[np.isfinite(probability)]
+    doubted = int((told < SURE_TREE).sum())
+    if doubted >= FEW_TREES and doubted > UNSURE * len(told):
+        yield Finding(
+            name="kinds", value=doubted / len(told), bound=UNSURE, unit="",
+            sentence=f"{doubted} of {len(told)} nodes that are called trees may be posts, pillars or corners of houses: what is here is unlike what the trunk "
+            f"score was trained on; believe those with kind_probability above {SURE_TREE} rather than the others",
+        )  # fmt: skip
+
+
+SURE_TREE, UNSURE, FEW_TREES = 0.9, 0.25, 4
 """Probability below which a tree is not surely one, share of them, and how many at least (33 simulated runs: up to 0.15; recorded stems, judged by scores that
 have not seen them: 0; a recorded street, where half of the trees are none: 0.33 to 0.6)."""
 FEW_SCANS, SELDOM = 50, 0.25

@@ -155,7 +155,7 @@ class Association:
 
 def associate_and_solve(
     problem: Problem, track: NDArray[np.int64], config: MappingConfig, progress: Progress
-) -> tuple[Decided, Estimate, int]:
+) -> tuple[Decided, Estimate, LoopCloser | None]:
     d = problem.detections
     estimate = graph.solve(problem, config.estimate, quick=True)
     if not len(d):
@@ -163,7 +163,7 @@ def associate_and_solve(
         none = np.zeros(0, np.int64)
         nothing = exists(d, none, np.zeros((0, 4, 4)), np.zeros((0, 3)), config.trees)
         empty = Decided(none, problem, nothing, shapes(d, none, np.zeros((0, 4, 4)), 0), 0)
-        return empty, replace(graph.solve(problem, config.estimate), tree=none), 0
+        return empty, replace(graph.solve(problem, config.estimate), tree=none), None
     a = Association(problem, track, config)
     end = float(problem.motion.distance[-1])
     cap = _gnss_cap(problem, a.way(estimate), config)
@@ -193,7 +193,7 @@ def associate_and_solve(
             if turned < SETTLED:
                 break
     progress("solve", 1.0)
-    return decided, estimate, a.closer.loops
+    return decided, estimate, a.closer
 
 
 FLIPS = 1e-4

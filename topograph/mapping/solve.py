@@ -33,7 +33,7 @@ class Solved:
         moving: share of the detections that were of things that moved or rode along.
         held_out: (H,) indices of the fixes withheld from the estimator.
         rejected: trees that did not exist.
-        loops: loops closed.
+        loops: loops closed; `slid`: the largest move of one where the planting is regular, in spacings.
     """
 
     run: Session
@@ -48,6 +48,7 @@ class Solved:
     held_out: NDArray[np.int64]
     rejected: int
     loops: int
+    slid: float
     moving: float
     seconds: dict[str, float]
 
@@ -85,7 +86,7 @@ def solve_session(
     """Prepare, associate and solve; see `prepare`."""
     began = time.perf_counter()
     p = prepare(run, config, check_fixes=check_fixes, known=known, placed=placed, datum=datum)
-    decided, estimate, loops = associate_and_solve(p.problem, p.track, config, progress)
+    decided, estimate, closer = associate_and_solve(p.problem, p.track, config, progress)
     return Solved(
         run=run,
         streams=p.streams,
@@ -98,7 +99,8 @@ def solve_session(
         shapes=decided.shapes,
         held_out=p.held_out,
         rejected=decided.rejected,
-        loops=loops,
+        loops=closer.loops if closer else 0,
+        slid=closer.slid if closer else 0.0,
         moving=p.moving,
         seconds={"read": run.seconds, "associate and solve": time.perf_counter() - began},
     )

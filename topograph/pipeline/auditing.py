@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from topograph import audit
 from topograph.audit import Finding, Verdict
@@ -23,7 +24,8 @@ def audited(solved: Solved) -> Verdict:
         *audit.trunks(p, e, solved.moving, solved.existence.kind == TREE),
         *_unclaimed(solved),
         *_seldom(solved),
-        *audit.unsure(solved.existence.probability[solved.existence.kind == TREE]),
+        *audit.unsure(solved.existence.probability[_own_trees(solved)]),
+        *audit.rows(solved.slid),
         *_mounts(solved),
     ]
     if any(f.name == "moving" for f in found):  # the same cause, and said of it
@@ -38,6 +40,15 @@ def _of_gnss(solved: Solved) -> Iterator[Finding]:
     yield from audit.jumps(p, e, solved.streams, _lever(solved))
     yield from audit.standing(solved.streams, solved.motion)
     yield from audit.headings(p, e)
+
+
+def _own_trees(solved: Solved) -> NDArray[np.bool_]:
+    """(T,) trees of this run: what an earlier map knows, few looks do not make doubtful."""
+    own = solved.existence.kind == TREE
+    if solved.problem.known is not None:
+        known = solved.problem.known.tree
+        own[known[known >= 0]] = False
+    return np.asarray(own)
 
 
 def _seldom(solved: Solved) -> Iterator[Finding]:

@@ -2,7 +2,7 @@
 
 from topograph.places.config import PlacesConfig
 from topograph.places.evidence import Placements, placements
-from topograph.places.index import MapIndex, build_index
+from topograph.places.index import MapIndex, build_index, irregularity
 from topograph.places.search import Found, Landmarks, search, searching, spread
 from topograph.places.search_kernels import Prior
 
@@ -14,6 +14,7 @@ __all__ = [
     "PlacesConfig",
     "Prior",
     "build_index",
+    "irregularity",
     "placements",
     "search",
     "searching",

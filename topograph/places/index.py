@@ -88,16 +88,16 @@ class MapIndex:
 
 
 def build_index(
-    xy: Array, var: Array, diameter: Array, view: float, longest: float, map_sigma: float = 0.03
-) -> MapIndex:
-    """Index of trees (T, 2) with variances per axis (T,) and diameters (T,) or NaN.
+    xy: Array, var: Array, diameter: Array, view: float, longest: float, map_sigma: float = 0.03, jitter: float | None = None,
+) -> MapIndex:  # fmt: skip
+    """Index of trees (T, 2) with variances per axis (T,) and diameters (T,) or NaN. `jitter` (m) where it is known of a larger planting that these are of.
 
     `map_sigma` (m) is what the variances do not know of the map's error; `view` is the range of detections (m); pairs up to `longest` are listed, fewer where trees are dense, so that a
     tree has about 30.
     """
     tree = cKDTree(xy)
     n = len(xy)
-    gap = float(np.median(np.asarray(tree.query(xy, min(2, n))[0])[:, -1])) if n > 1 else 5.0
+    gap = spacing(tree)
     cell = float(np.clip(0.25 * gap, 0.25, 1.0))
     low, high = xy.min(0) - 2.0, xy.max(0) + 2.0
     while np.prod((high - low) / cell) > max(4e6, 100.0 * n):  # far islands of trees: a coarser raster
@@ -121,7 +121,7 @@ def build_index(
     length = np.linalg.norm(xy[pairs[:, 0]] - xy[pairs[:, 1]], axis=1) if len(pairs) else np.zeros(0)
     by_length = np.argsort(length)
     ok = np.isfinite(diameter)
-    jitter = _jitter(tree, xy, var + map_sigma**2, gap)
+    jitter = _jitter(tree, xy, var + map_sigma**2, gap) if jitter is None else jitter
     area = (
         float(np.prod(high - low + 10.0)) if len(covered) * 100.0 > 0.3 * np.prod(high - low) else len(covered) * 400.0
     )
@@ -147,6 +147,19 @@ def build_index(
         diameter_mean=float(np.mean(diameter[ok])) if ok.any() else np.nan,
         diameter_sd=_spread(diameter[ok]),
     )
+
+
+def spacing(tree: cKDTree) -> float:
+    """Usual distance of a tree to the next one, m."""
+    xy, n = np.asarray(tree.data), int(tree.n)
+    return float(np.median(np.asarray(tree.query(xy, 2)[0])[:, -1])) if n > 1 else 5.0
+
+
+def irregularity(xy: Array, var: Array) -> tuple[float, float]:
+    """Jitter per axis of a planting (T, 2) whose trees are known to `var` (T,) per axis, and its spacing, m."""
+    tree = cKDTree(xy)
+    gap = spacing(tree)
+    return _jitter(tree, xy, var, gap), gap
 
 
 def _covered_area(xy: Array, gap: float) -> float:

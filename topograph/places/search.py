@@ -72,7 +72,7 @@ def spread(m: Array, cov: Array) -> Array:
     return np.asarray(np.maximum(0.5 * (v[0::2] + v[1::2]), 1e-6))
 
 
-ANYWHERE = Prior(np.zeros(3), np.zeros((2, 2)), np.inf)
+ANYWHERE = Prior(np.zeros(3), np.zeros((2, 2)), 1e12)
 """Nothing is known of the place beforehand."""
 SLICE = 8_000
 """Pairs of trees that are tried at once while tracking: some ten milliseconds."""

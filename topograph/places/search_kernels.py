@@ -24,7 +24,7 @@ class Marks(NamedTuple):
 
 class Prior(NamedTuple):
     """What is known beforehand of where the landmarks' frame lies: `at` (3,) x, y, yaw, covariance `cov` (2, 2) of the place, m², deviation
-    `yaw_sigma` of the yaw, rad; infinite: nothing."""
+    `yaw_sigma` of the yaw, rad; from 1e9 on: nothing is known, of the place neither."""
 
     at: Array
     cov: Array

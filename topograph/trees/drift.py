@@ -17,6 +17,8 @@ SLACK = 2.0
 """Of the wheels' share of the distance: a slope, soft ground, a tyre."""
 STRAIGHT = 1e-3
 """rad per m, of wheels whose radii differ or a steering that is not straight; a tenth of it with a gyro."""
+KNOTS = 500
+"""Of a way, at most: the drift is asked for every few metres, and may reach back to the run's beginning."""
 GYRO = 0.3
 """Of the yaw that wheels gather per root metre, with a gyro."""
 
@@ -45,7 +47,7 @@ def drift(way: Way, since: float, until: float, centre: Array, motion: Motion, n
     lies between. An error of yaw shifts the piece by its distance from where it arose. What changes (slips, a gyro's bias) adds up in variance.
     """
     inside = way.distance[(way.distance > since) & (way.distance < until)]
-    knots = np.concatenate([[since], inside, [until]])
+    knots = np.concatenate([[since], inside[:: len(inside) // KNOTS + 1], [until]])
     pose = way.at(knots)
     step, turn, d = np.diff(pose[:, :2], axis=0), np.diff(pose[:, 2]), np.diff(knots)
     arm = centre - 0.5 * (pose[1:, :2] + pose[:-1, :2])
@@ -59,6 +61,9 @@ def drift(way: Way, since: float, until: float, centre: Array, motion: Motion, n
     cov = (SLACK * noise.along) ** 2 * np.outer(longer, longer) + share**2 * np.outer(turned, turned)
     cov += (STRAIGHT * (0.1 if motion.gyro else 1.0)) ** 2 * np.outer(curved, curved)
     cov += per_metre**2 * (by_yaw.T * d) @ by_yaw
+    if len(motion.unseen):  # turned in gaps of the gyro
+        blind = noise.yaw_wheels * np.diff(np.interp(knots, motion.distance, motion.unseen))
+        cov += (by_yaw.T * blind**2) @ by_yaw
     slips = (SLACK * noise.along) ** 2 * LASTS * (until - since)
     if len(motion.doubt):
         slips += float(np.diff(np.interp([since, until], motion.distance, motion.doubt))[0]) ** 2
@@ -67,8 +72,9 @@ def drift(way: Way, since: float, until: float, centre: Array, motion: Motion, n
 
 def bounded(cov: Array, cap: float) -> Array:
     """A drift (3, 3) that something else holds to `cap` m as well, and to a fiftieth of that in rad."""
-    held = np.array([cap, cap, max(0.02, cap / 50.0)])
-    return np.asarray(np.linalg.inv(np.linalg.inv(cov) + np.diag(1.0 / held**2)))
+    held = np.diag(np.array([cap, cap, max(0.02, cap / 50.0)]) ** 2)
+    both = cov @ np.linalg.solve(cov + held, held)
+    return np.asarray(0.5 * (both + both.T))
 
 
 def deviation(cov: Array) -> float:

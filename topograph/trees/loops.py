@@ -1,8 +1,7 @@
-"""Closes loops: the trees around the robot now, laid as one rigid piece onto those mapped long ago.
+"""Closes loops: the trees around the robot now, laid as one piece onto those mapped long ago.
 
-Single nearest neighbours are not enough where dead reckoning has drifted by more than half a row. All recent trees
-must fit together (joint compatibility, Neira & Tardós 2001), better than any other placement and better than not
-being on old ground at all; otherwise the decision waits for more trees.
+Single nearest neighbours are not enough where dead reckoning has drifted by more than half a row. The piece must fit better than at any
+other place, and better than not being on old ground at all; otherwise the decision waits for more trees.
 """
 
 from __future__ import annotations
@@ -15,7 +14,17 @@ from scipy.spatial import cKDTree
 
 from topograph.geometry import Array, planar, transform
 from topograph.motion import Motion, MotionConfig
-from topograph.places import Landmarks, PlacesConfig, Prior, build_index, placements, search, spread
+from topograph.places import (
+    Found,
+    Landmarks,
+    PlacesConfig,
+    Prior,
+    build_index,
+    irregularity,
+    placements,
+    search,
+    spread,
+)
 from topograph.trees.detections import Detections
 from topograph.trees.drift import Way, bounded, deviation, drift
 from topograph.trees.tracks import TreesConfig
@@ -67,8 +76,8 @@ class LoopCloser:
 
     Attributes:
         tree: (T,) tree of each track; equal numbers are one tree.
-        anchored: distance driven when old ground was last recognised, m.
-        loops: loops closed so far.
+        anchored: distance driven when old ground was last recognised, or in view, m.
+        loops: loops closed so far; `slid`: the largest move of one in a regular planting, in spacings.
         closed: the last loop, None where it moved nothing by much.
     """
 
@@ -78,6 +87,7 @@ class LoopCloser:
         self.at = 0.0
         self.anchored = 0.0
         self.loops = 0
+        self.slid = 0.0
         self.closed: Closed | None = None
 
     def advance(self, table: TrackTable, way: Way, end: float, cap: float) -> bool:
@@ -123,11 +133,13 @@ class LoopCloser:
         self.closed = None  # a small step the solver takes by itself
         if found.moved > 0.8:
             before = float(np.median(t.last[seen_again]))
-            self.closed = Closed(before=before, since=self.anchored, now=self.at, centre=found.centre, move=found.move)
+            since = min(max(self.anchored, before), self.at - c.window)
+            self.closed = Closed(before=before, since=since, now=self.at, centre=found.centre, move=found.move)
         for i, j in found.pairs:
             self.tree[self.tree == here_id[i]] = there_id[j]
         self.anchored = self.at
         self.loops += 1
+        self.slid = max(self.slid, found.slid)
         return found.moved > 0.4
 
 
@@ -165,12 +177,13 @@ def _hits(t: TrackTable, tree: NDArray[np.int64], chosen: NDArray[np.bool_]) -> 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recognised:
     """Old ground: `pairs` (i, j) of recent and old trees that are one, the `move` (x, y, yaw) of the recent ones about their `centre` (2,), and how far it moves
-    one of them at most (`moved`, m)."""
+    one of them at most (`moved`, m); `slid` that in spacings where the planting is regular, else 0."""
 
     pairs: list[tuple[int, int]]
     move: Array
     centre: Array
     moved: float
+    slid: float
 
 
 PLACES = PlacesConfig(
@@ -183,6 +196,12 @@ HOLDING = 3
 """Trees of old ground that are in view hold the path: fewer leave its heading open."""
 AROUND, SHOWN = 2.0, 0.5
 """m about a recent tree where an old one would have been seen again, and the chance of that."""
+SAFE = 0.25
+"""Of the spacing: what dead reckoning knows to this is the same tree, however regular the planting."""
+ENOUGH = 9
+"""Trees from which the planting's irregularity is measured."""
+REGULAR = 2.0
+"""Nats by which a tree of another place fits better than anywhere: where a lattice is as regular as its trees are known."""
 PAIR = 25.0
 """Longest pair of trees that a search begins with, m."""
 APART = 0.8
@@ -194,8 +213,9 @@ def recognise(
 ) -> Recognised | None:  # fmt: skip
     """Are the trees `here` (N, 2) among those `there` (M, 2), given how far dead reckoning may be `off` (3, 3)? None: no, or undecided.
 
-    `here_cov` (N, N) is joint, per axis: the piece is not quite rigid, what was seen together hangs together. `mapped` (N,) is the chance of each recent tree to be in the map if this is old ground. The place search proposes; what the drift makes of it, how it compares
-    with its rivals, and with new ground, where all trees are new, is decided here: by `margin` nats.
+    `here_cov` (N, N) is joint, per axis: the piece is not quite rigid, what was seen together hangs together. `mapped` (N,) is the chance of each recent
+    tree to be in the map if this is old ground. The place search proposes; what the drift makes of it, how it compares
+    with new ground, where all trees are new, is decided here, by `margin` nats; against its rivals by `RIVAL` times that.
     """
     centre = here.mean(0)
     arm = float(np.sqrt(np.mean(np.sum((here - centre) ** 2, axis=1)))) + 1.0
@@ -203,7 +223,11 @@ def recognise(
     near = np.flatnonzero(cKDTree(here).query(there)[0] < reach)
     if len(near) < 2:
         return None
-    index = build_index(there[near], there_sigma[near] ** 2, np.full(len(near), np.nan), PAIR, PAIR, PLACES.map_sigma)
+    # How regular the planting is, few trees cannot tell.
+    most, their = (there, there_sigma**2) if len(there) >= ENOUGH else (here, np.diag(here_cov))
+    jitter, gap = irregularity(most, their + PLACES.map_sigma**2)
+    nan = np.full(len(near), np.nan)
+    index = build_index(there[near], there_sigma[near] ** 2, nan, PAIR, PAIR, PLACES.map_sigma, jitter)
     unknown = np.full(len(here), np.nan)
     area = float(np.prod(np.ptp(np.concatenate([here, there[near]]), axis=0) + 10.0))
     density = max(len(near) / area, 1e-4)  # of things, trees or not, that turn up anywhere
@@ -212,9 +236,14 @@ def recognise(
         m=here - centre, cov=cov, var=spread(here - centre, cov), diameter=unknown, diameter_var=unknown,
         tree=np.log(mapped / SHOWN), other=np.log((1.0 - mapped) * density), lasting=mapped,
     )  # fmt: skip
-    found = search(marks, index, PLACES, Prior(np.array([*centre, 0.0]), off[:2, :2], float(np.sqrt(off[2, 2]))))
-    found = replace(found, pose=np.concatenate([[[*centre, 0.0]], found.pose]))  # dead reckoning's own place too
-    placed = placements(found, marks, *_looked_at(marks.m), index, PLACES)
+    # In a lattice a new tree stands where one of another place stands: to fit more trees there tells little.
+    variance = float(np.median(marks.var) + np.median(there_sigma[near] ** 2)) + PLACES.map_sigma**2
+    alike = max(0.0, float(np.log(np.median(mapped) / (2 * np.pi * (variance + 2.0 * jitter**2)) / density)))
+    prior = Prior(np.array([*centre, 0.0]), np.ascontiguousarray(off[:2, :2]), float(np.sqrt(off[2, 2])))
+    found = search(replace(marks, tree=marks.tree - alike), index, PLACES, prior)
+    ours = Found(np.array([[*centre, 0.0]]), np.zeros(1), 0.0, 0)  # dead reckoning's own place too
+    tried = replace(found, pose=np.concatenate([ours.pose, found.pose]), loss=np.concatenate([ours.loss, found.loss]))
+    placed = placements(tried, marks, *_looked_at(marks.m), index, PLACES)
     if not len(placed):
         return None
     # Integrated over the pose: a normal of what the trees leave open and of the drift.
@@ -226,24 +255,26 @@ def recognise(
         - 0.5 * np.einsum("mi,mij,mj->m", away, np.linalg.inv(total), away)
         - 0.5 * np.linalg.slogdet(2 * np.pi * total)[1]
     )
-    # In a lattice a new tree stands where one of another place stands: to fit more trees there tells little.
-    variance = float(np.median(marks.var) + np.median(there_sigma[near] ** 2)) + PLACES.map_sigma**2
-    alike = max(0.0, float(np.log(np.median(mapped) / (2 * np.pi * (variance + 2.0 * index.jitter**2)) / density)))
     among = log - alike * (placed.tree >= 0).sum(axis=1)
     best = int(np.argmax(among))
     corners = np.array([[0, 0], [arm, 0], [0, arm]])
-    ends = np.stack([planar_points(pose, corners) for pose in placed.pose])
+    ends = np.stack([_moved(pose, corners) for pose in placed.pose])
     rivals = among[np.abs(ends - ends[best]).max(axis=(1, 2)) > APART]
-    rest = among.min() + np.log(found.rest) if found.rest > 0 else -np.inf
+    rest = among[best] + found.loss[0] - found.loss[-1] + np.log(found.rest) if found.rest > 0 else -np.inf
     new_ground = float(len(here) * np.log(density))
-    surer = float(among[best] - np.logaddexp.reduce([*rivals, rest, -np.inf]))
+    nothing = -np.inf
+    if deviation(off) + arm * np.sqrt(off[2, 2]) > SAFE * gap:  # else what lies on each other is the same tree
+        beside = int((np.asarray(cKDTree(here).query(there[near])[0]) < AROUND).sum())
+        nothing = float(marks.other.sum()) + beside * np.log(1.0 - SHOWN)
+    surer = float(among[best] - np.logaddexp.reduce([*rivals, rest, nothing]))
     if log[best] - new_ground < margin or surer < RIVAL * margin:
         return None
     move = off @ np.linalg.solve(total[best], away[best])  # as far as the drift allows
-    moved = float(np.abs(planar_points(move, here - centre) - (here - centre)).max())
+    moved = float(np.abs(_moved(move, here - centre) - (here - centre)).max())
     rows = np.flatnonzero(placed.tree[best] >= 0)
     pairs = [(int(i), int(near[placed.tree[best, i]])) for i in rows]
-    return Recognised(pairs=pairs, move=move, centre=centre, moved=moved)
+    slid = moved / gap if alike > REGULAR else 0.0
+    return Recognised(pairs=pairs, move=move, centre=centre, moved=moved, slid=slid)
 
 
 def _in_map(cov: Array, yaw: Array) -> Array:
@@ -254,7 +285,7 @@ def _in_map(cov: Array, yaw: Array) -> Array:
     return np.asarray(R @ cov @ R.swapaxes(1, 2))
 
 
-def planar_points(pose: Array, points: Array) -> Array:
+def _moved(pose: Array, points: Array) -> Array:
     """Points (N, 2) turned and shifted by a pose (3,) x, y, yaw."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return np.asarray(points @ np.array([[c, s], [-s, c]]) + pose[:2])

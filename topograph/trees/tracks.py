@@ -27,7 +27,7 @@ class TreesConfig:
         window: distance between two attempts to close a loop, m.
         recent: distance driven that counts as "here and now", m.
         mapped: chance that a trunk seen on old ground is already in the map.
-        margin: log-odds by which a loop must beat its rivals and the absence of a loop.
+        margin: log-odds by which a loop must beat the absence of a loop; its rivals by half as much again.
         merge: two trees nearer than this are one (stems of one tree), m.
         min_sightings: of a tree that exists.
         min_ratio: least ratio of its sightings to the scans that should show it (recorded detections).

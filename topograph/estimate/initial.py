@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from topograph.estimate.problem import Problem
 from topograph.geometry import Array, fit_rigid_2d, planar, transform, wrap, yaw_of
@@ -25,8 +26,10 @@ def initial_path(problem: Problem) -> Array:
     half = 60.0 if problem.motion.gyro else 20.0
     centres, values = [], []
     for c in np.arange(at[0], at[-1] + 10.0, 10.0):
-        chosen = np.abs(at - c) < half
-        if chosen.sum() < 5 or np.ptp(antenna[chosen, :2], axis=0).max() < 4.0:
+        chosen = slice(
+            int(np.searchsorted(at, c - half, "right")), int(np.searchsorted(at, c + half))
+        )  # keyframes, and so distances, rise
+        if chosen.stop - chosen.start < 5 or np.ptp(antenna[chosen, :2], axis=0).max() < 4.0:
             continue
         source, target = antenna[chosen], fixes.map_p_antenna[chosen]
         x, y, yaw = _robust_fit(source[:, :2], target[:, :2])
@@ -39,16 +42,18 @@ def initial_path(problem: Problem) -> Array:
     # Far-apart windows give shifts about different turns; compare them where the robot is.
     yaw_all = np.interp(distance, centres, np.unwrap(v[:, 2]))
     here = odom[:, :2, 3]
-    placed = np.empty((len(centres), len(distance), 2))
-    for n, (x, y, yaw, _) in enumerate(values):
+
+    def placed(window: NDArray[np.int64]) -> Array:
+        """Where each pose lies by the fit of its `window` (K,)."""
+        x, y, yaw = v[window, :3].T
         c, s = np.cos(yaw), np.sin(yaw)
-        placed[n] = np.stack([c * here[:, 0] - s * here[:, 1] + x, s * here[:, 0] + c * here[:, 1] + y], axis=1)
+        return np.stack([c * here[:, 0] - s * here[:, 1] + x, s * here[:, 0] + c * here[:, 1] + y], axis=1)
+
     i = np.clip(np.searchsorted(centres, distance) - 1, 0, max(len(centres) - 2, 0))
     j = np.minimum(i + 1, len(centres) - 1)
     span = np.maximum(np.array(centres)[j] - np.array(centres)[i], 1e-9)
     u = np.clip((distance - np.array(centres)[i]) / span, 0.0, 1.0)[:, None]
-    k = np.arange(len(distance))
-    xy = (1 - u) * placed[i, k] + u * placed[j, k]
+    xy = (1 - u) * placed(i) + u * placed(j)
     out = planar(0.0, 0.0, yaw_all) @ odom
     out[:, :2, 3] = xy
     out[:, 2, 3] = odom[:, 2, 3] + np.interp(distance, centres, v[:, 3])

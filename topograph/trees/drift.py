@@ -51,9 +51,8 @@ def drift(way: Way, since: float, until: float, centre: Array, motion: Motion, n
     pose = way.at(knots)
     step, turn, d = np.diff(pose[:, :2], axis=0), np.diff(pose[:, 2]), np.diff(knots)
     arm = centre - 0.5 * (pose[1:, :2] + pose[:-1, :2])
-    by_yaw = np.column_stack(
-        [-arm[:, 1], arm[:, 0], np.ones(len(d))]
-    )  # what an error of yaw of each step does to the piece
+    # What an error of yaw of each step does to the piece.
+    by_yaw = np.column_stack([-arm[:, 1], arm[:, 0], np.ones(len(d))])
     longer = np.append(step.sum(axis=0), 0.0)
     turned, curved = turn @ by_yaw, d @ by_yaw
     share = noise.yaw_gyro if motion.gyro else noise.yaw_wheels

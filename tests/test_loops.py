@@ -319,3 +319,17 @@ def test_a_drift_knows_of_slips_and_of_gaps_of_the_gyro() -> None:
     np.testing.assert_allclose(slip - plain, np.diag([2.25, 2.25, 0.0]), atol=1e-9)
     assert np.sqrt(plain[2, 2]) < 0.03  # with a gyro; by the wheels, ten times that
     assert np.sqrt(drift(way, 0.0, end, centre, motion_of(distance, gyro=False), MotionConfig())[2, 2]) > 0.2
+
+
+def test_more_trees_of_a_lattice_do_not_outvote_where_it_is() -> None:
+    """Six columns are mapped, the piece begins at the fourth and goes on: laid three columns back all of it fits, where it is a third of it."""
+    rng = np.random.default_rng(9)
+    for _ in range(10):
+        there = alley(rng, 0, 3, 5.0, 0.03)
+        there, here = there[there[:, 0] < 27.0], alley(rng, 0, 3, 5.0, 0.03)
+        here = here[(here[:, 0] > 13.0) & (here[:, 0] < 43.0)]
+        off = np.diag([8.0**2, 1.0**2, 0.05**2])
+        got = recognise(
+            here, 0.0025 * np.eye(len(here)), there, np.full(len(there), 0.05), off, 7.0, np.full(len(here), 0.6)
+        )
+        assert got is None or np.abs(got.move[:2]).max() < 1.0

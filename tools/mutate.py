@@ -124,7 +124,8 @@ def run(b: Break, copy: Path, everything: bool) -> tuple[Break, bool | None, flo
             capture_output=True,
             check=False,
         )
-        return b, done.returncode == 1, time.monotonic() - began
+        # 1: a test failed; a signal: the break ends the program. 4 and 5 are no tests.
+        return b, done.returncode == 1 or done.returncode < 0, time.monotonic() - began
     finally:
         path.write_text(text)
 

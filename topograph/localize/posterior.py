@@ -99,7 +99,7 @@ def weigh(found: Found, marks: Landmarks, submap: Submap, index: MapIndex, confi
     c = config
     if not len(found.pose) or len(marks) < 2:
         return nothing()
-    placed = placements(found, marks, submap.raster, submap.origin, index, c.places)
+    placed = placements(found.pose, marks, submap.raster, submap.origin, index, c.places)
     if not len(placed):
         return nothing()
     log = placed.log + np.log(1.0 - c.unknown - c.alike) - np.log(index.area * 2 * np.pi)

@@ -13,6 +13,7 @@ from topograph.mapping.config import MappingConfig
 from topograph.mapping.progress import Progress
 from topograph.trees import (
     AtKeyframes,
+    Closed,
     Existence,
     LoopCloser,
     Shapes,
@@ -88,7 +89,7 @@ class Association:
         if loop is None:
             return self.solve(e)
         start = loop.bent(self.problem.motion.distance_at(e.stamps_ns), e.map_T_robot)
-        return self.solve(replace(e, map_T_robot=start), link=_link(self.problem, e, self.closer))
+        return self.solve(replace(e, map_T_robot=start), link=_link(self.problem, e, loop))
 
     def solve(self, e: Estimate, *, least: int = 3, patient: bool = False, link: Link | None = None) -> Estimate:
         """An estimate without covariances of the trees as they are now; `patient`: until it has converged."""
@@ -214,11 +215,8 @@ SETTLED = 0.01
 """Slopes of trees that change by less between two solves do not change what was solved, m/m."""
 
 
-def _link(problem: Problem, estimate: Estimate, closer: LoopCloser) -> Link | None:
+def _link(problem: Problem, estimate: Estimate, loop: Closed) -> Link | None:
     """The loop just closed as one relative pose: it pulls the path over distances at which robust losses let go."""
-    loop = closer.closed
-    if loop is None:
-        return None
     distance = problem.motion.distance_at(problem.stamps_ns)
     a, b = (int(np.clip(np.searchsorted(distance, d), 0, len(distance) - 1)) for d in (loop.before, loop.now))
     if a == b:

@@ -16,7 +16,7 @@ from topograph.geometry import Array
 from topograph.places.config import PlacesConfig
 from topograph.places.evidence_kernels import evidence_kernel, unlike_kernel
 from topograph.places.index import MapIndex
-from topograph.places.search import Found, Landmarks
+from topograph.places.search import Landmarks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,14 +44,14 @@ class Placements:
 
 
 def placements(
-    found: Found, marks: Landmarks, raster: Array, origin: Array, index: MapIndex, config: PlacesConfig
+    poses: Array, marks: Landmarks, raster: Array, origin: Array, index: MapIndex, config: PlacesConfig
 ) -> Placements:
-    """Those that a search found, aligned and weighed. `raster` (X, Y) holds, per cell of 1 m about `origin` (2,) in the landmarks'
+    """Those of `poses` (P, 3) that a search found, aligned and weighed. `raster` (X, Y) holds, per cell of 1 m about `origin` (2,) in the landmarks'
     frame, looks as the sum of -ln(1 - chance of detection)."""
     c = config
     prior = np.log(np.array(c.scale_prior) / np.sum(c.scale_prior))
     log, pose, information, tree, scale, alike = evidence_kernel(
-        found.pose, marks.bundle, marks.cov, index.trees, index.grid, raster, origin, c.felled, c.map_sigma**2,
+        poses, marks.bundle, marks.cov, index.trees, index.grid, raster, origin, c.felled, c.map_sigma**2,
         index.trust, 2.0 * index.jitter**2, np.array(c.scales), prior,
     )  # fmt: skip
     order = np.argsort(-log)

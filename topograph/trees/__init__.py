@@ -5,7 +5,7 @@ from topograph.trees.drift import Way, deviation, drift
 from topograph.trees.existence import Existence, exists, seen_through
 from topograph.trees.foot import grounds
 from topograph.trees.keyframes import choose_keyframes
-from topograph.trees.loops import LoopCloser, TrackTable, moved_pose, tabulate
+from topograph.trees.loops import Closed, LoopCloser, TrackTable, moved_pose, tabulate
 from topograph.trees.refine import refine
 from topograph.trees.screen import screen
 from topograph.trees.shape import Shapes, relevelled, shapes
@@ -16,6 +16,7 @@ from topograph.trees.wheels import with_trunks_way
 
 __all__ = [
     "AtKeyframes",
+    "Closed",
     "Detections",
     "Existence",
     "LoopCloser",

@@ -7,6 +7,7 @@ other place, and better than not being on old ground at all; otherwise the decis
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,6 @@ from scipy.spatial import cKDTree
 from topograph.geometry import Array, planar, transform
 from topograph.motion import Motion, MotionConfig
 from topograph.places import (
-    Found,
     Landmarks,
     PlacesConfig,
     Prior,
@@ -115,28 +115,26 @@ class LoopCloser:
         old = mature & ~is_recent & (t.last < self.at - c.recent)
         if not old.any():
             return False
-        here, here_id, here_sigma = _centres(t, self.tree, now)
-        there, there_id, there_sigma = _centres(t, self.tree, old)
-        centre = here.mean(0)
+        here, there = _piece(t, self.tree, now, self.at - c.recent), _piece(t, self.tree, old)
+        centre = here.place.mean(0)
         off = bounded(drift(way, min(self.anchored, self.at - c.window), self.at, centre, self.motion, self.noise), cap)
         # The piece itself is not quite rigid.
         within = drift(way, self.at - 0.5 * c.recent, self.at, centre, self.motion, self.noise)
         bend = min(0.5 * deviation(within), 0.3 * cap)
-        weight = c.mapped * (1.0 - np.exp(-_hits(t, self.tree, now) / 6.0))
-        seen_at = _mean(t, self.tree, now, np.maximum(0.5 * (t.first + t.last), self.at - c.recent))
-        apart = np.abs(seen_at[:, None] - seen_at) / (0.5 * c.recent)
-        here_cov = np.diag(here_sigma**2) + bend**2 * np.exp(-apart)
-        found = recognise(here, here_cov, there, there_sigma, off, c.margin, weight)
+        weight = c.mapped * (1.0 - np.exp(-here.hits / 6.0))
+        apart = np.abs(here.seen[:, None] - here.seen) / (0.5 * c.recent)
+        here_cov = np.diag(here.sigma**2) + bend**2 * np.exp(-apart)
+        found = recognise(here.place, here_cov, there.place, there.sigma, off, c.margin, weight)
         if found is None:
             return False
-        seen_again = np.isin(self.tree, there_id[[j for _, j in found.pairs]]) & old
+        seen_again = np.isin(self.tree, there.ids[[j for _, j in found.pairs]]) & old
         self.closed = None  # a small step the solver takes by itself
         if found.moved > 0.8:
             before = float(np.median(t.last[seen_again]))
             since = min(max(self.anchored, before), self.at - c.window)
             self.closed = Closed(before=before, since=since, now=self.at, centre=found.centre, move=found.move)
         for i, j in found.pairs:
-            self.tree[self.tree == here_id[i]] = there_id[j]
+            self.tree[self.tree == here.ids[i]] = there.ids[j]
         self.anchored = self.at
         self.loops += 1
         self.slid = max(self.slid, found.slid)
@@ -152,26 +150,29 @@ def moved_pose(pose: Array, centre: Array, move: Array) -> Array:
     return np.asarray(out)
 
 
-def _centres(
-    t: TrackTable, tree: NDArray[np.int64], chosen: NDArray[np.bool_]
-) -> tuple[Array, NDArray[np.int64], Array]:
-    """Place (K, 2), id (K,) and sigma (K,) of the trees that the chosen tracks belong to."""
+class _Piece(NamedTuple):
+    """Trees as their tracks have them: `place` (K, 2), `ids` (K,), `sigma` (K,) m, `hits` (K,) sightings, `seen` (K,) the middle of when they were, m driven."""
+
+    place: Array
+    ids: NDArray[np.int64]
+    sigma: Array
+    hits: Array
+    seen: Array
+
+
+def _piece(t: TrackTable, tree: NDArray[np.int64], chosen: NDArray[np.bool_], since: float = -np.inf) -> _Piece:
+    """The trees that the chosen tracks belong to, their means by sightings; what was seen earlier counts as seen `since`."""
     ids, index = np.unique(tree[chosen], return_inverse=True)
     w = t.hits[chosen].astype(float)
     total = np.bincount(index, w)
-    place = np.stack([np.bincount(index, w * t.place[chosen, k]) / total for k in range(2)], axis=1)
-    return place, ids, np.bincount(index, w * t.sigma[chosen]) / total
 
+    def mean(x: Array) -> Array:
+        return np.asarray(np.bincount(index, w * x[chosen]) / total)
 
-def _mean(t: TrackTable, tree: NDArray[np.int64], chosen: NDArray[np.bool_], x: Array) -> Array:
-    """Mean (K,), by sightings, of `x` (T,) over the chosen tracks of each tree, in the order of `_centres`."""
-    index = np.unique(tree[chosen], return_inverse=True)[1]
-    return np.asarray(np.bincount(index, t.hits[chosen] * x[chosen]) / np.bincount(index, t.hits[chosen]))
-
-
-def _hits(t: TrackTable, tree: NDArray[np.int64], chosen: NDArray[np.bool_]) -> Array:
-    """Sightings (K,) of the trees that the chosen tracks belong to, in the order of `_centres`."""
-    return np.bincount(np.unique(tree[chosen], return_inverse=True)[1], t.hits[chosen]).astype(float)
+    place = np.stack([mean(t.place[:, k]) for k in range(2)], axis=1)
+    return _Piece(
+        place, ids, mean(t.sigma), np.asarray(total, float), mean(np.maximum(0.5 * (t.first + t.last), since))
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -220,7 +221,8 @@ def recognise(
     centre = here.mean(0)
     arm = float(np.sqrt(np.mean(np.sum((here - centre) ** 2, axis=1)))) + 1.0
     reach = 3.0 * deviation(off) + 3.0 * float(np.sqrt(off[2, 2])) * arm + 1.0
-    near = np.flatnonzero(cKDTree(here).query(there)[0] < reach)
+    apart = np.asarray(cKDTree(here).query(there)[0])
+    near = np.flatnonzero(apart < reach)
     if len(near) < 2:
         return None
     # How regular the planting is, few trees cannot tell.
@@ -241,8 +243,7 @@ def recognise(
     alike = max(0.0, float(np.log(np.median(mapped) / (2 * np.pi * (variance + 2.0 * jitter**2)) / density)))
     prior = Prior(np.array([*centre, 0.0]), np.ascontiguousarray(off[:2, :2]), float(np.sqrt(off[2, 2])))
     found = search(replace(marks, tree=marks.tree - alike), index, PLACES, prior)
-    ours = Found(np.array([[*centre, 0.0]]), np.zeros(1), 0.0, 0)  # dead reckoning's own place too
-    tried = replace(found, pose=np.concatenate([ours.pose, found.pose]), loss=np.concatenate([ours.loss, found.loss]))
+    tried = np.concatenate([[[*centre, 0.0]], found.pose])  # dead reckoning's own place too
     placed = placements(tried, marks, *_looked_at(marks.m), index, PLACES)
     if not len(placed):
         return None
@@ -264,7 +265,7 @@ def recognise(
     new_ground = float(len(here) * np.log(density))
     nothing = -np.inf
     if deviation(off) + arm * np.sqrt(off[2, 2]) > SAFE * gap:  # else what lies on each other is the same tree
-        beside = int((np.asarray(cKDTree(here).query(there[near])[0]) < AROUND).sum())
+        beside = int((apart[near] < AROUND).sum())
         nothing = float(marks.other.sum()) + beside * np.log(1.0 - SHOWN)
     surer = float(among[best] - np.logaddexp.reduce([*rivals, rest, nothing]))
     if log[best] - new_ground < margin or surer < RIVAL * margin:
@@ -279,16 +280,13 @@ def recognise(
 
 def _in_map(cov: Array, yaw: Array) -> Array:
     """Covariances (M, 3, 3) of poses in their own frames, turned into the map's."""
-    R = np.zeros((len(yaw), 3, 3))
-    R[:, 0, 0] = R[:, 1, 1] = np.cos(yaw)
-    R[:, 1, 0], R[:, 0, 1], R[:, 2, 2] = np.sin(yaw), -np.sin(yaw), 1.0
+    R = planar(0.0, 0.0, yaw)[:, :3, :3]  # the third is the yaw, which stays
     return np.asarray(R @ cov @ R.swapaxes(1, 2))
 
 
 def _moved(pose: Array, points: Array) -> Array:
     """Points (N, 2) turned and shifted by a pose (3,) x, y, yaw."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return np.asarray(points @ np.array([[c, s], [-s, c]]) + pose[:2])
+    return np.asarray(points @ planar(*pose)[:2, :2].T + pose[:2])
 
 
 def _looked_at(m: Array) -> tuple[Array, Array]:

@@ -137,7 +137,8 @@ def test_scattered_trees_are_recognised_and_put_back(seed: int, x: float, y: flo
     found, here, is_tree = seen_again(rng, trees, np.array([x, y, yaw]))
     if found is None:  # undecided is allowed, wrong is not
         return
-    assert sum(is_tree[i] == j for i, j in found.pairs) >= len(found.pairs) - 1
+    beside = np.linalg.norm(trees[[j for _, j in found.pairs]] - trees[is_tree[[i for i, _ in found.pairs]]], axis=1)
+    assert (beside > 0.5).sum() <= 1  # two that stand nearer may be taken for each other
     back = transform(moved_pose(np.eye(4), found.centre, found.move), np.column_stack([here, np.zeros(len(here))]))[
         :, :2
     ]
@@ -207,10 +208,10 @@ def test_a_loop_is_shut_over_the_way_since() -> None:
     distance, pose = u_turn()
     poses = np.array([planar(*p) for p in pose])
     loop = Closed(before=5.0, since=20.0, now=50.0, centre=np.array([10.0, 6.0]), move=np.array([2.0, -1.0, 0.3]))
-    got = loop.bent(distance, poses)
+    got = loop.bent(distance, poses, motion_of(distance, gyro=False), MotionConfig())
     early, late = distance <= 20.0, distance >= 50.0
     np.testing.assert_array_equal(got[early], poses[early])
-    np.testing.assert_allclose(got[late], [moved_pose(T, loop.centre, loop.move) for T in poses[late]])
+    np.testing.assert_allclose(got[late], [moved_pose(T, loop.centre, loop.move) for T in poses[late]], atol=0.03)
     longer = np.linalg.norm(np.diff(got[:, :2, 3], axis=0), axis=1) - np.diff(distance)
     assert np.abs(longer).max() < 0.2  # nothing is torn
 

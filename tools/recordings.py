@@ -221,7 +221,7 @@ def map_at(poses: Array, trunks: list[Trunks], config: Config) -> Mapped:
         gyro=True,
         wheels=True,
     )
-    track = follow(d, motion, config.trees)
+    track, _ = follow(d, motion, config.trees, config.motion)
     keep = screen(d, track, motion).keep
     d, track = d.select(keep), np.unique(track[keep], return_inverse=True)[1]
     seen = transform(poses[d.scan], d.p)

@@ -16,6 +16,7 @@ from topograph.trees import (
     Closed,
     Existence,
     LoopCloser,
+    Loops,
     Shapes,
     TrackTable,
     Way,
@@ -88,7 +89,8 @@ class Association:
         loop = self.closer.closed
         if loop is None:
             return self.solve(e)
-        start = loop.bent(self.problem.motion.distance_at(e.stamps_ns), e.map_T_robot)
+        motion = self.problem.motion
+        start = loop.bent(motion.distance_at(e.stamps_ns), e.map_T_robot, motion, self.config.motion)
         return self.solve(replace(e, map_T_robot=start), link=_link(self.problem, e, loop))
 
     def solve(self, e: Estimate, *, least: int = 3, patient: bool = False, link: Link | None = None) -> Estimate:
@@ -155,8 +157,8 @@ class Association:
 
 
 def associate_and_solve(
-    problem: Problem, track: NDArray[np.int64], config: MappingConfig, progress: Progress
-) -> tuple[Decided, Estimate, LoopCloser | None]:
+    problem: Problem, track: NDArray[np.int64], guess: Array | None, config: MappingConfig, progress: Progress
+) -> tuple[Decided, Estimate, Loops]:
     d = problem.detections
     estimate = graph.solve(problem, config.estimate, quick=True)
     if not len(d):
@@ -164,9 +166,11 @@ def associate_and_solve(
         none = np.zeros(0, np.int64)
         nothing = exists(d, none, np.zeros((0, 4, 4)), np.zeros((0, 3)), config.trees)
         empty = Decided(none, problem, nothing, shapes(d, none, np.zeros((0, 4, 4)), 0), 0)
-        return empty, replace(graph.solve(problem, config.estimate), tree=none), None
+        return empty, replace(graph.solve(problem, config.estimate), tree=none), Loops()
     a = Association(problem, track, config)
     end = float(problem.motion.distance[-1])
+    if guess is not None:
+        estimate = a.solve(replace(estimate, map_T_robot=guess))
     cap = _gnss_cap(problem, a.way(estimate), config)
     while a.closer.advance(a.table(estimate), a.way(estimate), end, cap):
         progress("associate", min(1.0, a.closer.at / max(end, 1e-9)))
@@ -194,7 +198,7 @@ def associate_and_solve(
             if turned < SETTLED:
                 break
     progress("solve", 1.0)
-    return decided, estimate, a.closer
+    return decided, estimate, a.closer.result
 
 
 FLIPS = 1e-4

@@ -18,7 +18,7 @@ from topograph.mapping.known import KnownMap, Placed, put
 from topograph.mapping.progress import Progress, silent
 from topograph.motion import Motion, align_imu, dead_reckon, in_radians, without_nonsense
 from topograph.session import Session, Streams
-from topograph.trees import Detections, Existence, Shapes, choose_keyframes, follow, screen, with_trunks_way
+from topograph.trees import Detections, Existence, Loops, Shapes, choose_keyframes, follow, screen, with_trunks_way
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,7 +33,6 @@ class Solved:
         moving: share of the detections that were of things that moved or rode along.
         held_out: (H,) indices of the fixes withheld from the estimator.
         rejected: trees that did not exist.
-        loops: loops closed; `slid`: the largest move of one where the planting is regular, in spacings.
     """
 
     run: Session
@@ -47,8 +46,7 @@ class Solved:
     shapes: Shapes
     held_out: NDArray[np.int64]
     rejected: int
-    loops: int
-    slid: float
+    loops: Loops
     moving: float
     seconds: dict[str, float]
 
@@ -69,6 +67,7 @@ class Prepared:
     streams: Streams
     problem: Problem
     track: NDArray[np.int64]
+    guess: Array | None
     moving: float
     held_out: NDArray[np.int64]
 
@@ -86,7 +85,7 @@ def solve_session(
     """Prepare, associate and solve; see `prepare`."""
     began = time.perf_counter()
     p = prepare(run, config, check_fixes=check_fixes, known=known, placed=placed, datum=datum)
-    decided, estimate, closer = associate_and_solve(p.problem, p.track, config, progress)
+    decided, estimate, loops = associate_and_solve(p.problem, p.track, p.guess, config, progress)
     return Solved(
         run=run,
         streams=p.streams,
@@ -99,8 +98,7 @@ def solve_session(
         shapes=decided.shapes,
         held_out=p.held_out,
         rejected=decided.rejected,
-        loops=closer.loops if closer else 0,
-        slid=closer.slid if closer else 0.0,
+        loops=loops,
         moving=p.moving,
         seconds={"read": run.seconds, "associate and solve": time.perf_counter() - began},
     )
@@ -147,9 +145,9 @@ def prepare(
     if screened:
         motion = with_trunks_way(motion, detections, streams.fix_ns)
     notes += _wheel_notes(motion)
-    track, moving = np.arange(len(detections)), 0.0
+    track, moving, put_right = np.arange(len(detections)), 0.0, None
     if screened:
-        detections, track, moving = _screened(detections, motion, config, notes)
+        detections, track, moving, put_right = _screened(detections, motion, config, notes)
     n_fix = len(run.streams.fix_ns)
     used = np.ones(n_fix, bool)
     if check_fixes > 0:
@@ -183,8 +181,19 @@ def prepare(
     if known is not None:
         problem = replace(problem, known=known.at(detections))
     return Prepared(
-        run=run, streams=streams, problem=problem, track=track, moving=moving, held_out=np.flatnonzero(~used)
-    )
+        run=run, streams=streams, problem=problem, track=track, guess=_guess(problem, put_right), moving=moving,
+        held_out=np.flatnonzero(~used),
+    )  # fmt: skip
+
+
+def _guess(problem: Problem, world_T_odom: Array | None) -> Array | None:
+    """The path (K, 4, 4) without the steps that the trunks say it did not do, where it is dead reckoning's and nothing else holds it."""
+    if world_T_odom is None or len(problem.fixes.keyframe) or problem.known is not None:
+        return None
+    if (world_T_odom == np.eye(4)).all():
+        return None
+    scans_ns = problem.detections.stamps_ns
+    return path_at(scans_ns, world_T_odom @ problem.motion.at(scans_ns), problem.motion, problem.stamps_ns)
 
 
 def _wheel_notes(motion: Motion) -> list[str]:
@@ -225,15 +234,15 @@ def _covered(detections: Detections, motion: Motion, notes: list[str]) -> Detect
 
 def _screened(
     detections: Detections, motion: Motion, config: MappingConfig, notes: list[str]
-) -> tuple[Detections, NDArray[np.int64], float]:
-    """The detections that may be of landmarks, their tracks, numbered without gaps, and the share of all that moved."""
-    track = follow(detections, motion, config.trees)
+) -> tuple[Detections, NDArray[np.int64], float, Array]:
+    """The detections that may be of landmarks, their tracks, numbered without gaps, the share of all that moved, and `follow`'s world_T_odom."""
+    track, world_T_odom = follow(detections, motion, config.trees, config.motion)
     screened = screen(detections, track, motion)
     if screened.moved:
         notes.append(f"{screened.moved} things that moved, or rode along with the robot, were left out")
     keep = screened.keep
     tracks = np.unique(track[keep], return_inverse=True)[1].astype(np.int64)
-    return detections.select(keep), tracks, screened.moving
+    return detections.select(keep), tracks, screened.moving, world_T_odom
 
 
 def _or(pose: Array | None, other: Array) -> Array:

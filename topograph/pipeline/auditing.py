@@ -25,7 +25,7 @@ def audited(solved: Solved) -> Verdict:
         *_unclaimed(solved),
         *_seldom(solved),
         *audit.unsure(solved.existence.probability[_own_trees(solved)]),
-        *audit.rows(solved.slid),
+        *audit.rows(solved.loops.slid),
         *_mounts(solved),
     ]
     if any(f.name == "moving" for f in found):  # the same cause, and said of it

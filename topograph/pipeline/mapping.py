@@ -154,7 +154,7 @@ def residual_metrics(solved: Solved) -> list[Metric]:
     out = [
         Metric("keyframes", len(e.stamps_ns)),
         Metric("distance driven", float(solved.motion.distance[-1]), "m"),
-        Metric("loops closed", solved.loops),
+        Metric("loops closed", solved.loops.closed),
     ]
     if len(s):
         seen = transform(e.map_T_robot[s.keyframe], s.p) - e.trees[s.tree]

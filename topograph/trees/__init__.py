@@ -5,7 +5,7 @@ from topograph.trees.drift import Way, deviation, drift
 from topograph.trees.existence import Existence, exists, seen_through
 from topograph.trees.foot import grounds
 from topograph.trees.keyframes import choose_keyframes
-from topograph.trees.loops import Closed, LoopCloser, TrackTable, moved_pose, tabulate
+from topograph.trees.loops import Closed, LoopCloser, Loops, TrackTable, moved_pose, tabulate
 from topograph.trees.refine import refine
 from topograph.trees.screen import screen
 from topograph.trees.shape import Shapes, relevelled, shapes
@@ -20,6 +20,7 @@ __all__ = [
     "Detections",
     "Existence",
     "LoopCloser",
+    "Loops",
     "Shapes",
     "Sightings",
     "SlipWatch",

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from topograph.geometry import Array, yaw_of
+from topograph.geometry import Array, planar, yaw_of
 from topograph.motion import Motion, MotionConfig
 
 LEAST = (0.05, 1e-3)
@@ -19,6 +20,8 @@ STRAIGHT = 1e-3
 """rad per m, of wheels whose radii differ or a steering that is not straight; a tenth of it with a gyro."""
 KNOTS = 500
 """Of a way, at most: the drift is asked for every few metres, and may reach back to the run's beginning."""
+BENDS = 3
+"""Times a way is bent, each by what the last has left: turns are no small ones."""
 GYRO = 0.3
 """Of the yaw that wheels gather per root metre, with a gyro."""
 
@@ -40,33 +43,100 @@ class Way:
         return np.stack([np.interp(distance, self.distance, self.pose[:, k]) for k in range(3)], axis=1)
 
 
+class _Sources(NamedTuple):
+    """What makes dead reckoning drift over a way, as unit normals: scales that last, then each step's own error of yaw.
+
+    Attributes:
+        knots: (K+1,) m driven; `step` (K, 2) and `turn` (K,) between them.
+        yaw: (K, S) what each source turns each step by, rad.
+        scale: of the steps, the first source's.
+        arms: (K, 3) what a turn of each step does to the piece, per rad.
+        slips: (K,) m², per axis, that each step adds.
+    """
+
+    knots: Array
+    step: Array
+    turn: Array
+    yaw: Array
+    scale: float
+    arms: Array
+    slips: Array
+
+    def effect(self) -> Array:
+        """(3, S) what each source does to the piece."""
+        out = self.arms.T @ self.yaw
+        out[:2, 0] = self.scale * self.step.sum(axis=0)
+        return out
+
+
+def _sources(way: Way, since: float, until: float, centre: Array, motion: Motion, noise: MotionConfig) -> _Sources:
+    inside = way.distance[(way.distance > since) & (way.distance < until)]
+    knots = np.concatenate([[since], inside[:: len(inside) // KNOTS + 1], [until]])
+    pose = way.at(knots)
+    step, turn, d = np.diff(pose[:, :2], axis=0), np.diff(pose[:, 2]), np.diff(knots)
+    arm = centre - 0.5 * (pose[1:, :2] + pose[:-1, :2])
+    share = noise.yaw_gyro if motion.gyro else noise.yaw_wheels
+    straight = STRAIGHT * (0.1 if motion.gyro else 1.0)
+    own = ((GYRO if motion.gyro else 1.0) * noise.yaw_distance) ** 2 * d
+    slips = (SLACK * noise.along) ** 2 * LASTS * d
+    if len(motion.unseen):  # turned in gaps of the gyro
+        own += (noise.yaw_wheels * np.diff(np.interp(knots, motion.distance, motion.unseen))) ** 2
+    if len(motion.doubt):
+        doubt = np.diff(np.interp(knots, motion.distance, motion.doubt))
+        slips += doubt.sum() * doubt  # one slip, however finely it is looked at
+    return _Sources(
+        knots=knots, step=step, turn=turn, scale=SLACK * noise.along, slips=slips,
+        yaw=np.column_stack([np.zeros(len(d)), share * turn, straight * d, np.diag(np.sqrt(own))]),
+        arms=np.column_stack([-arm[:, 1], arm[:, 0], np.ones(len(d))]),
+    )  # fmt: skip
+
+
 def drift(way: Way, since: float, until: float, centre: Array, motion: Motion, noise: MotionConfig) -> Array:
     """Covariance (3, 3) of x, y, yaw (m, rad) of a piece about `centre` (2,) that is seen after `until` m, against what was seen after `since` m.
 
     Scales of wheels and turns stay the same over a run: their errors are as large as the way there is long, or the turn wide, whatever
     lies between. An error of yaw shifts the piece by its distance from where it arose. What changes (slips, a gyro's bias) adds up in variance.
     """
-    inside = way.distance[(way.distance > since) & (way.distance < until)]
-    knots = np.concatenate([[since], inside[:: len(inside) // KNOTS + 1], [until]])
-    pose = way.at(knots)
-    step, turn, d = np.diff(pose[:, :2], axis=0), np.diff(pose[:, 2]), np.diff(knots)
-    arm = centre - 0.5 * (pose[1:, :2] + pose[:-1, :2])
-    # What an error of yaw of each step does to the piece.
-    by_yaw = np.column_stack([-arm[:, 1], arm[:, 0], np.ones(len(d))])
-    longer = np.append(step.sum(axis=0), 0.0)
-    turned, curved = turn @ by_yaw, d @ by_yaw
-    share = noise.yaw_gyro if motion.gyro else noise.yaw_wheels
-    per_metre = (GYRO if motion.gyro else 1.0) * noise.yaw_distance
-    cov = (SLACK * noise.along) ** 2 * np.outer(longer, longer) + share**2 * np.outer(turned, turned)
-    cov += (STRAIGHT * (0.1 if motion.gyro else 1.0)) ** 2 * np.outer(curved, curved)
-    cov += per_metre**2 * (by_yaw.T * d) @ by_yaw
-    if len(motion.unseen):  # turned in gaps of the gyro
-        blind = noise.yaw_wheels * np.diff(np.interp(knots, motion.distance, motion.unseen))
-        cov += (by_yaw.T * blind**2) @ by_yaw
-    slips = (SLACK * noise.along) ** 2 * LASTS * (until - since)
-    if len(motion.doubt):
-        slips += float(np.diff(np.interp([since, until], motion.distance, motion.doubt))[0]) ** 2
-    return np.asarray(cov + np.diag([slips + LEAST[0] ** 2, slips + LEAST[0] ** 2, LEAST[1] ** 2]))
+    s = _sources(way, since, until, centre, motion, noise)
+    J = s.effect()
+    slips = s.slips.sum() + LEAST[0] ** 2
+    return np.asarray(J @ J.T + np.diag([slips, slips, LEAST[1] ** 2]))
+
+
+def bent(way: Way, since: float, until: float, centre: Array, move: Array, motion: Motion, noise: MotionConfig) -> Way:
+    """The way with its end moved: what is seen about `centre` (2,) after `until` m by `move` (x, y, yaw), what was passed before `since` not at all.
+
+    In between where dead reckoning is most likely to have gone astray: most of an error of yaw by wheels arose where they turned.
+    """
+    left, at = move, centre
+    for _ in range(BENDS):
+        end = way.at(np.array([until]))[0]
+        way = _bent(way, since, until, at, left, motion, noise)
+        now = way.at(np.array([until]))[0]
+        turned = now[2] - end[2]
+        at = now[:2] + planar(0.0, 0.0, turned)[:2, :2] @ (at - end[:2])
+        left = np.append(centre + move[:2] - at, left[2] - turned)
+    return way
+
+
+def _bent(way: Way, since: float, until: float, centre: Array, move: Array, motion: Motion, noise: MotionConfig) -> Way:
+    """As `bent`, exact for small moves."""
+    s = _sources(way, since, until, centre, motion, noise)
+    J = s.effect()
+    slips = s.slips.sum() + LEAST[0] ** 2
+    pull = np.linalg.solve(J @ J.T + np.diag([slips, slips, LEAST[1] ** 2]), move)
+    z = J.T @ pull
+    turned = np.concatenate([[0.0], np.cumsum(s.yaw @ z)])
+    middle = planar(0.0, 0.0, 0.5 * (turned[1:] + turned[:-1]))[:, :2, :2]
+    step = np.einsum("kij,kj->ki", middle, s.step * (1.0 + s.scale * z[0])) + s.slips[:, None] * pull[:2]
+    old = way.at(s.knots)[:, :2]
+    new = old[0] + np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)])
+    # Between two knots, and beyond the last one, stiff.
+    yaw = np.interp(way.distance, s.knots, turned)
+    at = np.clip(np.searchsorted(s.knots, way.distance, side="right") - 1, 0, len(s.knots) - 1)
+    arm = np.einsum("kij,kj->ki", planar(0.0, 0.0, yaw)[:, :2, :2], way.pose[:, :2] - old[at])
+    xy = np.where((way.distance > since)[:, None], new[at] + arm, way.pose[:, :2])
+    return Way(distance=way.distance, pose=np.column_stack([xy, way.pose[:, 2] + yaw]))
 
 
 def bounded(cov: Array, cap: float) -> Array:

@@ -26,7 +26,7 @@ from topograph.places import (
     spread,
 )
 from topograph.trees.detections import Detections
-from topograph.trees.drift import Way, bounded, deviation, drift
+from topograph.trees.drift import Way, bent, bounded, deviation, drift
 from topograph.trees.tracks import TreesConfig
 from topograph.trunks.score import POST, TREE
 
@@ -55,6 +55,19 @@ class TrackTable:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Loops:
+    """A run's loops.
+
+    Attributes:
+        closed: how many.
+        slid: the largest move of one in a regular planting, in spacings.
+    """
+
+    closed: int = 0
+    slid: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Closed:
     """A loop: what was seen `before` is seen again `now`; dead reckoning has gone astray `since` (distances driven, m). The new piece turns about
     `centre` (2,) and shifts by `move` (x, y, yaw)."""
@@ -65,10 +78,13 @@ class Closed:
     centre: Array
     move: Array
 
-    def bent(self, distance: Array, map_T_robot: Array) -> Array:
+    def bent(self, distance: Array, map_T_robot: Array, motion: Motion, noise: MotionConfig) -> Array:
         """Poses (K, 4, 4) after `distance` (K,) m with the loop shut: what went astray is spread over the way since."""
-        share = np.clip((distance - self.since) / max(self.now - self.since, 1e-9), 0.0, 1.0)
-        return np.array([moved_pose(T, self.centre, k * self.move) for k, T in zip(share, map_T_robot, strict=True)])
+        way = Way.of(distance, map_T_robot)
+        new = bent(way, self.since, self.now, self.centre, self.move, motion, noise)
+        out = planar(0.0, 0.0, new.pose[:, 2] - way.pose[:, 2]) @ map_T_robot
+        out[:, :2, 3] = new.pose[:, :2]
+        return np.asarray(out)
 
 
 class LoopCloser:
@@ -140,6 +156,11 @@ class LoopCloser:
         self.slid = max(self.slid, found.slid)
         return found.moved > 0.4
 
+    @property
+    def result(self) -> Loops:
+        """What became of it."""
+        return Loops(closed=self.loops, slid=self.slid)
+
 
 def moved_pose(pose: Array, centre: Array, move: Array) -> Array:
     """A pose (4, 4) turned about `centre` (2,) and shifted by `move` (x, y, yaw) in the plane."""
@@ -201,8 +222,8 @@ SAFE = 0.25
 """Of the spacing: what dead reckoning knows to this is the same tree, however regular the planting."""
 ENOUGH = 9
 """Trees from which the planting's irregularity is measured."""
-REGULAR = 2.0
-"""Nats by which a tree of another place fits better than anywhere: where a lattice is as regular as its trees are known."""
+REGULAR = 1.0
+"""Squares of the jitter, in variances of where trees are, below which a lattice looks the same from every row: a row beside costs twice that per tree, in nats."""
 PAIR = 25.0
 """Longest pair of trees that a search begins with, m."""
 APART = 0.8
@@ -263,18 +284,18 @@ def recognise(
     rivals = among[np.abs(ends - ends[best]).max(axis=(1, 2)) > APART]
     rest = among[best] + found.loss[0] - found.loss[-1] + np.log(found.rest) if found.rest > 0 else -np.inf
     new_ground = float(len(here) * np.log(density))
-    nothing = -np.inf
+    beyond = -np.inf
     if deviation(off) + arm * np.sqrt(off[2, 2]) > SAFE * gap:  # else what lies on each other is the same tree
         beside = int((apart[near] < AROUND).sum())
-        nothing = float(marks.other.sum()) + beside * np.log(1.0 - SHOWN)
-    surer = float(among[best] - np.logaddexp.reduce([*rivals, rest, nothing]))
+        beyond = float(marks.other.sum()) + beside * np.log(1.0 - SHOWN)
+    surer = float(among[best] - np.logaddexp.reduce([*rivals, rest, beyond]))
     if log[best] - new_ground < margin or surer < RIVAL * margin:
         return None
     move = off @ np.linalg.solve(total[best], away[best])  # as far as the drift allows
     moved = float(np.abs(_moved(move, here - centre) - (here - centre)).max())
     rows = np.flatnonzero(placed.tree[best] >= 0)
     pairs = [(int(i), int(near[placed.tree[best, i]])) for i in rows]
-    slid = moved / gap if alike > REGULAR else 0.0
+    slid = moved / gap if jitter**2 < REGULAR * variance else 0.0
     return Recognised(pairs=pairs, move=move, centre=centre, moved=moved, slid=slid)
 
 
@@ -320,7 +341,7 @@ def tabulate(detections: Detections, track: NDArray[np.int64], map_T_scan: Array
         foot=np.stack([mean(foot[:, k]) for k in range(2)], axis=1),
         width=mean(np.nan_to_num(d.diameter)),
         post=mean(d.believed * np.nan_to_num(d.kinds[:, POST] - d.kinds[:, TREE])),
-        sigma=np.sqrt(mean(0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1])) / np.sqrt(total)),
+        sigma=np.sqrt(mean(d.sigma**2) / np.sqrt(total)),
         first=first,
         last=last,
         hits=hits,

@@ -106,7 +106,7 @@ def shapes(
     away = _directions(d, map_T_scan, middle)
     views = np.minimum(((np.arctan2(away[:, 1], away[:, 0]) + np.pi) / (2 * np.pi) * VIEWS).astype(np.int64), VIEWS - 1)
     slope = slope - _seen_lean(slope, weight, away, order, ends) * away
-    trust = d.believed / np.maximum(0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1]), 1e-6)
+    trust = d.believed / np.maximum(d.sigma**2, 1e-6)
     places, slopes = _Views(n, VIEW_SIGMA), _Views(n, VIEW_LEAN)
     forked = _forked_probability(_told(d, order, ends))
     for j in range(n):

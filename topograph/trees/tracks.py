@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from topograph.geometry import Array, transform
-from topograph.motion import Motion
+from topograph.geometry import Array, planar, transform
+from topograph.motion import Motion, MotionConfig
 from topograph.ranges import Chance, Count, NonNegative, Positive, Share
 from topograph.trees.detections import Detections
 from topograph.trees.gating import gated, seen_again
+from topograph.trees.whole import misstep
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,19 +58,23 @@ class TreesConfig:
 class Tracker:
     """Follows trunks from scan to scan in the odometry frame, by gated optimal assignment; fed forwards, live and in batch.
 
-    A track's place follows the newest sightings, so that it drifts with dead reckoning and not against it. Tracks are named in the
+    A track's place follows the newest sightings, so that it drifts with dead reckoning and not against it; where a step was off by more than
+    trees are known, all tracks are moved with it, and `world_T_odom` (4, 4), which starts as identity, adds up what it was. Tracks are named in the
     order of their birth; what has not been seen for `config.forget` m is forgotten.
     """
 
     def __init__(self, config: TreesConfig) -> None:
         self.config = config
         self.born = 0
+        self.world_T_odom = np.eye(4)
         self._ids: NDArray[np.int64] = np.zeros(0, np.int64)
         self._place, self._spread = np.zeros((0, 2)), np.zeros((0, 2, 2))
         self._seen, self._hits = np.zeros(0), np.zeros(0)
 
-    def step(self, p: Array, cov: Array, distance: float) -> NDArray[np.int64]:
-        """Track (N,) of each trunk of one scan at `p` (N, 2) with `cov` (N, 2, 2), after `distance` m driven."""
+    def step(self, p: Array, cov: Array, distance: float, at: Array, off: Array) -> NDArray[np.int64]:
+        """Track (N,) of each trunk of one scan at `p` (N, 2) with `cov` (N, 2, 2), after `distance` m driven, seen from `at` (2,); `off` (3,) is how
+        far dead reckoning may be off since the last scan: x, y, m, and yaw, rad, standard deviations.
+        """
         c = self.config
         keep = distance - self._seen < c.forget
         if not keep.all():
@@ -78,6 +83,7 @@ class Tracker:
         n = len(p)
         if n == 0:
             return np.zeros(0, np.int64)
+        self._keep_step(p, cov, distance, at, off)
         pairs, cost = gated(p, cov, self._place, self._spread, distance - self._seen, c.floor, c.drift, c.gate)
         match = assigned(pairs, cost, n, len(self._ids))
         seen_again(p, cov, match, self._place, self._spread, self._hits)
@@ -92,6 +98,25 @@ class Tracker:
         self._seen = np.concatenate([self._seen, np.full(len(new), distance)])
         self._hits = np.concatenate([self._hits, np.ones(len(new))])
         return track
+
+    def _keep_step(self, p: Array, cov: Array, distance: float, at: Array, off: Array) -> None:
+        """Move the tracks with a step of dead reckoning that was off."""
+        c, arm = self.config, p - at
+        if max(off[0], off[1], off[2] * float(np.abs(arm).max())) < c.floor or not len(self._ids):
+            return
+        turned = np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+        wide = cov + np.diag(off[:2] ** 2) + off[2] ** 2 * turned[:, :, None] * turned[:, None, :]
+        pairs, _ = gated(p, wide, self._place, self._spread, distance - self._seen, c.floor, c.drift, c.gate)
+        if len(pairs) < 2:
+            return
+        i, j = pairs[:, 0], pairs[:, 1]
+        var = 0.5 * np.trace(cov[i] + self._spread[j], axis1=1, axis2=2) + c.floor**2
+        step = misstep(self._place[j] - p[i], arm[i], var, i, off, c.gate)
+        if step is not None:
+            to, back = planar(at[0] + step[0], at[1] + step[1], step[2]), planar(-at[0], -at[1], 0.0)
+            self.world_T_odom = self.world_T_odom @ to @ back
+            R = planar(0.0, 0.0, -step[2])[:2, :2]
+            self._place = np.ascontiguousarray((self._place - at - step[:2]) @ R.T + at)
 
 
 def assigned(pairs: NDArray[np.int64], cost: Array, rows: int, columns: int) -> NDArray[np.int64]:
@@ -120,21 +145,25 @@ FAR = 1e6
 """Cost of a pair that is none."""
 
 
-def follow(detections: Detections, motion: Motion, config: TreesConfig) -> NDArray[np.int64]:
-    """Track (N,) of each detection, in the order of the scans."""
+def follow(
+    detections: Detections, motion: Motion, config: TreesConfig, noise: MotionConfig
+) -> tuple[NDArray[np.int64], Array]:
+    """Track (N,) of each detection, in the order of the scans, and `world_T_odom` (S, 4, 4), which takes steps out of dead reckoning that the
+    trunks say it did not do: a first guess, where the path would otherwise begin as dead reckoning left it.
+    """
     if not len(detections):
-        return np.zeros(0, np.int64)
+        return np.zeros(0, np.int64), np.tile(np.eye(4), (len(detections.stamps_ns), 1, 1))
     odom_T_robot = motion.at(detections.stamps_ns)
     distance = motion.distance_at(detections.stamps_ns).tolist()
     p = np.ascontiguousarray(transform(odom_T_robot[detections.scan], detections.p)[:, :2])
-    cov = _planar_cov(detections, odom_T_robot)
+    cov = detections.planar_cov(odom_T_robot)
     ends = np.searchsorted(detections.scan, np.arange(len(detections.stamps_ns) + 1)).tolist()
-    tracker = Tracker(config)
-    return np.concatenate(
-        [tracker.step(p[a:b], cov[a:b], d) for a, b, d in zip(ends[:-1], ends[1:], distance, strict=True)]
-    )
-
-
-def _planar_cov(detections: Detections, odom_T_robot: Array) -> Array:
-    R = odom_T_robot[detections.scan, :3, :3]
-    return np.ascontiguousarray((R @ detections.cov @ np.swapaxes(R, 1, 2))[:, :2, :2])
+    at = odom_T_robot[:, :2, 3]
+    sigma = motion.sigma(noise, detections.stamps_ns)
+    along = np.maximum(sigma[:, 3], sigma[:, 4])
+    off = np.concatenate([np.zeros((1, 3)), np.stack([along, along, sigma[:, 2]], axis=1)])
+    tracker, track, put_right = Tracker(config), [], []
+    for a, b, d, *step in zip(ends[:-1], ends[1:], distance, at, off, strict=True):
+        track.append(tracker.step(p[a:b], cov[a:b], d, *step))
+        put_right.append(tracker.world_T_odom)
+    return np.concatenate(track), np.array(put_right)

@@ -57,7 +57,14 @@ def test_wheels_that_turn_too_far_do_not_break_tracks(doubt: float, tracks: int 
         off = np.array([0.01, 0.01, 1.2 * doubt * (turn[1] - turn[0]) * 1.2 if k else 0.0])
         for i, name in zip(
             seen,
-            tracker.step(reckoned, np.tile(0.03**2 * np.eye(2), (len(seen), 1, 1)), 0.05 * k, np.zeros(2), off),
+            tracker.step(
+                reckoned,
+                np.tile(0.03**2 * np.eye(2), (len(seen), 1, 1)),
+                np.full(len(seen), 0.03**2),
+                0.05 * k,
+                np.zeros(2),
+                off,
+            ),
             strict=True,
         ):
             of[int(i)].add(int(name))

@@ -16,6 +16,7 @@ from topograph.audit.checks import (
     unsure,
 )
 from topograph.audit.verdict import Finding, Verdict
+from topograph.audit.way import way
 
 __all__ = [
     "REFUSING",
@@ -33,4 +34,5 @@ __all__ = [
     "twice",
     "unclaimed",
     "unsure",
+    "way",
 ]

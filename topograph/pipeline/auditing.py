@@ -26,6 +26,7 @@ def audited(solved: Solved) -> Verdict:
         *_seldom(solved),
         *audit.unsure(solved.existence.probability[_own_trees(solved)]),
         *audit.rows(solved.loops.slid),
+        *audit.way(p, e),
         *_mounts(solved),
     ]
     if any(f.name == "moving" for f in found):  # the same cause, and said of it

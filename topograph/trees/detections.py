@@ -61,8 +61,9 @@ class Detections:
         column = np.exp(self.kinds[:, 0]) + np.exp(self.kinds[:, 1])
         return np.where(np.isfinite(column), np.clip(column, LEAST_BELIEVED, 1.0), 1.0)
 
-    def planar_cov(self, level_T_scan: Array | None = None) -> Array:
-        """Covariance (N, 2, 2) in the plane of where each axis stands, m²: the scans' poses' (S, 4, 4), or the robot's own. Along itself an axis is known
+    @property
+    def sigma(self) -> Array:
+        """(N,) standard deviation, per axis, of where each axis stands in the robot's plane, m. Along itself an axis is known
         to `ALONG` at least: a recorded detection does not say where on the trunk it lies, and metres along a leaning axis
         would be as many decimetres on the ground.
         """
@@ -70,15 +71,6 @@ class Detections:
         across = np.eye(3) - a * self.axis[:, None, :]
         var = np.minimum(self.axis[:, None, :] @ self.cov @ a, ALONG**2)
         cov = across @ self.cov @ across + var * a * self.axis[:, None, :]
-        if level_T_scan is not None:
-            R = level_T_scan[self.scan, :3, :3]
-            cov = R @ cov @ np.swapaxes(R, 1, 2)
-        return np.ascontiguousarray(cov[:, :2, :2])
-
-    @property
-    def sigma(self) -> Array:
-        """(N,) standard deviation of the place in the robot's plane, m."""
-        cov = self.planar_cov()
         return np.sqrt(0.5 * (cov[:, 0, 0] + cov[:, 1, 1]))
 
     @staticmethod

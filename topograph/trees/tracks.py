@@ -71,9 +71,9 @@ class Tracker:
         self._place, self._spread = np.zeros((0, 2)), np.zeros((0, 2, 2))
         self._seen, self._hits = np.zeros(0), np.zeros(0)
 
-    def step(self, p: Array, cov: Array, distance: float, at: Array, off: Array) -> NDArray[np.int64]:
-        """Track (N,) of each trunk of one scan at `p` (N, 2) with `cov` (N, 2, 2), after `distance` m driven, seen from `at` (2,); `off` (3,) is how
-        far dead reckoning may be off since the last scan: x, y, m, and yaw, rad, standard deviations.
+    def step(self, p: Array, cov: Array, var: Array, distance: float, at: Array, off: Array) -> NDArray[np.int64]:
+        """Track (N,) of each trunk of one scan at `p` (N, 2) with `cov` (N, 2, 2), after `distance` m driven, seen from `at` (2,). `var` (N,) is what
+        is known of each at its own height, m² per axis; a leaning one may be looked for further away. `off` (3,) is how far dead reckoning may be off since the last scan: x, y, m, and yaw, rad, standard deviations.
         """
         c = self.config
         keep = distance - self._seen < c.forget
@@ -83,7 +83,7 @@ class Tracker:
         n = len(p)
         if n == 0:
             return np.zeros(0, np.int64)
-        self._keep_step(p, cov, distance, at, off)
+        self._keep_step(p, cov, var, distance, at, off)
         pairs, cost = gated(p, cov, self._place, self._spread, distance - self._seen, c.floor, c.drift, c.gate)
         match = assigned(pairs, cost, n, len(self._ids))
         seen_again(p, cov, match, self._place, self._spread, self._hits)
@@ -99,7 +99,7 @@ class Tracker:
         self._hits = np.concatenate([self._hits, np.ones(len(new))])
         return track
 
-    def _keep_step(self, p: Array, cov: Array, distance: float, at: Array, off: Array) -> None:
+    def _keep_step(self, p: Array, cov: Array, var: Array, distance: float, at: Array, off: Array) -> None:
         """Move the tracks with a step of dead reckoning that was off."""
         c, arm = self.config, p - at
         if max(off[0], off[1], off[2] * float(np.abs(arm).max())) < c.floor or not len(self._ids):
@@ -110,8 +110,7 @@ class Tracker:
         if len(pairs) < 2:
             return
         i, j = pairs[:, 0], pairs[:, 1]
-        var = 0.5 * np.trace(cov[i] + self._spread[j], axis1=1, axis2=2) + c.floor**2
-        step = misstep(self._place[j] - p[i], arm[i], var, i, off, c.gate)
+        step = misstep(self._place[j] - p[i], arm[i], 2.0 * var[i] + c.floor**2, i, off, c.gate)
         if step is not None:
             to, back = planar(at[0] + step[0], at[1] + step[1], step[2]), planar(-at[0], -at[1], 0.0)
             self.world_T_odom = self.world_T_odom @ to @ back
@@ -156,7 +155,9 @@ def follow(
     odom_T_robot = motion.at(detections.stamps_ns)
     distance = motion.distance_at(detections.stamps_ns).tolist()
     p = np.ascontiguousarray(transform(odom_T_robot[detections.scan], detections.p)[:, :2])
-    cov = detections.planar_cov(odom_T_robot)
+    R = odom_T_robot[detections.scan, :3, :3]
+    cov = np.ascontiguousarray((R @ detections.cov @ np.swapaxes(R, 1, 2))[:, :2, :2])
+    var = detections.sigma**2
     ends = np.searchsorted(detections.scan, np.arange(len(detections.stamps_ns) + 1)).tolist()
     at = odom_T_robot[:, :2, 3]
     sigma = motion.sigma(noise, detections.stamps_ns)
@@ -164,6 +165,6 @@ def follow(
     off = np.concatenate([np.zeros((1, 3)), np.stack([along, along, sigma[:, 2]], axis=1)])
     tracker, track, put_right = Tracker(config), [], []
     for a, b, d, *step in zip(ends[:-1], ends[1:], distance, at, off, strict=True):
-        track.append(tracker.step(p[a:b], cov[a:b], d, *step))
+        track.append(tracker.step(p[a:b], cov[a:b], var[a:b], d, *step))
         put_right.append(tracker.world_T_odom)
     return np.concatenate(track), np.array(put_right)

@@ -164,3 +164,30 @@ def test_trees_that_hardly_a_scan_shows_are_doubted() -> None:
     assert found.value > found.bound
     assert not list(audit.seldom(300, 200))
     assert not list(audit.seldom(20, 1))
+
+
+@pytest.mark.parametrize(
+    ("yaw", "scale", "at_fixes", "said"),
+    [(0.3, 1.0, False, True), (-0.3, 1.0, False, True), (0.3, 1.0, True, False), (0.0, 1.04, False, False)],
+)
+def test_a_path_that_trees_bent_where_the_wheels_went_straight_is_doubted(
+    yaw: float, scale: float, at_fixes: bool, said: bool
+) -> None:
+    """60 m straight on, and the estimate has a turn within the 30th; wheels that are off by 4 % are wheels; fixes that hold the path know better."""
+    n = 61
+    p = problem(planar(np.arange(n, dtype=float), 0, 0), np.zeros((1, 3)), 0.03, np.random.default_rng(0))
+    turned = np.where(np.arange(n) > 30, yaw, 0.0)
+    path = np.cumsum(np.column_stack([np.cos(turned), np.sin(turned)]), axis=0) * scale
+    e = Estimate(
+        stamps_ns=p.stamps_ns, map_T_robot=planar(path[:, 0], path[:, 1], turned), trees=np.zeros((0, 3)), tree_cov=np.zeros((0, 3, 3)),
+        joint=None, datum_cov=np.zeros((3, 3)), tree=np.zeros(0, np.int64), weights=np.ones(0), seconds=0.0,
+    )  # fmt: skip
+    if at_fixes:
+        k = np.arange(0, n, 5)
+        zeros = np.zeros((len(k), 3))
+        p = replace(p, fixes=Fixes(k, zeros, path[k] @ np.eye(2, 3), np.tile(1e-4 * np.eye(3), (len(k), 1, 1)), zeros))
+    found = list(audit.way(p, e))
+    assert bool(found) == said
+    if said:
+        assert "17° within 6 m" in found[0].sentence
+        assert not found[0].refuses

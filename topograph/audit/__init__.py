@@ -15,8 +15,8 @@ from topograph.audit.checks import (
     unclaimed,
     unsure,
 )
+from topograph.audit.reckoned import way
 from topograph.audit.verdict import Finding, Verdict
-from topograph.audit.way import way
 
 __all__ = [
     "REFUSING",

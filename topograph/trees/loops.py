@@ -224,6 +224,8 @@ ENOUGH = 9
 """Trees from which the planting's irregularity is measured."""
 REGULAR = 1.0
 """Squares of the jitter, in variances of where trees are, below which a lattice looks the same from every row: a row beside costs twice that per tree, in nats."""
+SCATTERED = 5
+"""Sightings from which a track's scatter tells its noise."""
 PAIR = 25.0
 """Longest pair of trees that a search begins with, m."""
 APART = 0.8
@@ -333,15 +335,19 @@ def tabulate(detections: Detections, track: NDArray[np.int64], map_T_scan: Array
     def mean(x: Array) -> Array:
         return np.asarray(np.bincount(track, x, minlength=n) / total)
 
+    place = np.stack([mean(xy[:, k]) for k in range(2)], axis=1)
+    # What a source does not say of its noise, or of a path that is still bent, the track's own scatter does.
+    scatter = mean(0.5 * np.sum((xy - place[track]) ** 2, axis=1)) * total / np.maximum(total - 1, 1)
+    variance = np.maximum(mean(d.sigma**2), np.where(total >= SCATTERED, scatter, 0.0))
     first, last = np.full(n, np.inf), np.full(n, -np.inf)
     np.minimum.at(first, track, driven)
     np.maximum.at(last, track, driven)
     return TrackTable(
-        place=np.stack([mean(xy[:, k]) for k in range(2)], axis=1),
+        place=place,
         foot=np.stack([mean(foot[:, k]) for k in range(2)], axis=1),
         width=mean(np.nan_to_num(d.diameter)),
         post=mean(d.believed * np.nan_to_num(d.kinds[:, POST] - d.kinds[:, TREE])),
-        sigma=np.sqrt(mean(d.sigma**2) / np.sqrt(total)),
+        sigma=np.sqrt(variance / np.sqrt(total)),
         first=first,
         last=last,
         hits=hits,

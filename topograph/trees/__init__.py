@@ -1,7 +1,7 @@
 """Trunks + a predicted path -> which trunks are one tree: tracking, loop closing, births and deaths."""
 
 from topograph.trees.detections import Detections
-from topograph.trees.drift import Way, deviation, drift
+from topograph.trees.drift import ASTRAY, SPAN, Way, astray, deviation, drift
 from topograph.trees.existence import Existence, exists, seen_through
 from topograph.trees.foot import grounds
 from topograph.trees.keyframes import choose_keyframes
@@ -15,6 +15,8 @@ from topograph.trees.tracks import Tracker, TreesConfig, follow
 from topograph.trees.wheels import with_trunks_way
 
 __all__ = [
+    "ASTRAY",
+    "SPAN",
     "AtKeyframes",
     "Closed",
     "Detections",
@@ -28,6 +30,7 @@ __all__ = [
     "Tracker",
     "TreesConfig",
     "Way",
+    "astray",
     "choose_keyframes",
     "deviation",
     "drift",

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from topograph.geometry import Array, planar, yaw_of
+from topograph.geometry import Array, planar, wrap, yaw_of
 from topograph.motion import Motion, MotionConfig
 
 LEAST = (0.05, 1e-3)
@@ -20,6 +20,13 @@ STRAIGHT = 1e-3
 """rad per m, of wheels whose radii differ or a steering that is not straight; a tenth of it with a gyro."""
 KNOTS = 500
 """Of a way, at most: the drift is asked for every few metres, and may reach back to the run's beginning."""
+SPAN = 6.0
+"""m of a way that are looked at together: more than a slip, less than a headland and its alleys."""
+HELD = 15.0
+"""m around a fix in which the fixes judge the path, and wheels that slip do not."""
+ASTRAY = 80.0
+"""Squared Mahalanobis distance (3 dof) of a path's from dead reckoning's way, over `SPAN` (ten minutes without GNSS on poor wheels: right maps up to 35,
+wrong ones from 170 on; Victoria Park 8, a recorded forest 3)."""
 BENDS = 3
 """Times a way is bent, each by what the last has left: turns are no small ones."""
 GYRO = 0.3
@@ -137,6 +144,40 @@ def _bent(way: Way, since: float, until: float, centre: Array, move: Array, moti
     arm = np.einsum("kij,kj->ki", planar(0.0, 0.0, yaw)[:, :2, :2], way.pose[:, :2] - old[at])
     xy = np.where((way.distance > since)[:, None], new[at] + arm, way.pose[:, :2])
     return Way(distance=way.distance, pose=np.column_stack([xy, way.pose[:, 2] + yaw]))
+
+
+class Astray(NamedTuple):
+    """Where a path leaves dead reckoning the most: squared Mahalanobis distance (3 dof), m driven, and the turn that it makes more, rad."""
+
+    distance2: float = 0.0
+    after: float = 0.0
+    turned: float = 0.0
+
+
+def astray(path: Way, motion: Motion, odom_T_robot: Array, noise: MotionConfig, held: Array) -> Astray:
+    """How a path contradicts its dead reckoning `odom_T_robot` (K, 4, 4) the most, over `SPAN` m, not nearer than `HELD` to what holds it, `held` (F,) m driven."""
+    reckoned = Way.of(path.distance, odom_T_robot)
+    worst = Astray()
+    for begin in np.arange(path.distance[0], path.distance[-1] - SPAN, SPAN / 4):
+        if len(held) and np.abs(held - begin - SPAN / 2).min() < HELD:
+            continue
+        a, b = (w.at(np.array([begin, begin + SPAN])) for w in (path, reckoned))
+        cov = drift(reckoned, begin, begin + SPAN, b[1, :2], motion, noise)
+        off = _turned(_step(a) - _step(b), b[0, 2])
+        off[2] = wrap(off[2])
+        distance2 = float(off @ np.linalg.solve(cov, off))
+        if distance2 > worst.distance2:
+            worst = Astray(distance2, float(begin), float(off[2]))
+    return worst
+
+
+def _step(pose: Array) -> Array:
+    """From the first of two poses (2, 3) to the second, in the first's frame."""
+    return _turned(pose[1] - pose[0], -pose[0, 2])
+
+
+def _turned(x: Array, yaw: float) -> Array:
+    return np.append(planar(0.0, 0.0, yaw)[:2, :2] @ x[:2], x[2])
 
 
 def bounded(cov: Array, cap: float) -> Array:

@@ -52,7 +52,8 @@ def test_wheels_that_turn_too_far_do_not_break_tracks(doubt: float, tracks: int 
     rng = np.random.default_rng(1)
     trees = np.stack(np.meshgrid(np.arange(6) * 5.0, np.arange(4) * 5.0), axis=2).reshape(-1, 2) - [12.5, 7.5]
     turn = np.linspace(0.0, np.pi, 31)
-    tracker, of = Tracker(TreesConfig()), {k: set() for k in range(len(trees))}
+    tracker = Tracker(TreesConfig())
+    of: dict[int, set[int]] = {k: set() for k in range(len(trees))}
     for k, yaw in enumerate(turn):
         seen = np.flatnonzero(rng.random(len(trees)) < 0.8)
         p = moved(trees[seen], np.array([0.0, 0.0, -yaw])) + rng.normal(0, 0.02, (len(seen), 2))

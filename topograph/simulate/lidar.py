@@ -67,7 +67,7 @@ def sweep(orchard: Orchard, config: SensorConfig, world_T_lidar: Array, time_s: 
         np.ascontiguousarray(world_T_lidar), angles, bias, cylinders, blobs, shapes.boxes, *lists,
         g.origin, g.height, g.grass, config.max_range, config.range_sigma, config.dropout, config.divergence, config.bark, seed,
     )  # fmt: skip
-    per_column = 1.0 / (config.sweep_hz * config.columns)
+    per_column = config.sweep_s / config.columns
     time = (column + laser / (1.5 * len(angles))) * per_column
     ring = len(angles) - 1 - order[laser] if config.from_top else order[laser]
     out = Sweep(

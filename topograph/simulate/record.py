@@ -129,9 +129,9 @@ def _clouds(
     stamps: list[int],
     run: DriveConfig,
 ) -> Iterator[Event]:
-    span = int(1e9 / sensor.sweep_hz)
-    starts = np.arange(int(way.stamps_ns[0]), int(way.stamps_ns[-1]) - span, span, dtype=np.int64)
-    for k in np.flatnonzero(_taken(way, starts, span, run)).tolist():
+    span, period = int(1e9 * sensor.sweep_s), int(1e9 / sensor.sweep_hz)
+    starts = np.arange(int(way.stamps_ns[0]), int(way.stamps_ns[-1]) - span, period, dtype=np.int64)
+    for k in np.flatnonzero(_taken(way, starts, span, period, run)).tolist():
         start = int(starts[k])
         end = start + span  # velodyne_driver stamps the last packet: times are negative
 
@@ -157,12 +157,12 @@ AT_STOPS_NS = 500_000_000
 """Time between two sweeps at a stop."""
 
 
-def _taken(way: Drive, starts: Stamps, span: int, run: DriveConfig) -> NDArray[np.bool_]:
-    """(S,) sweeps from `starts` on that are recorded."""
+def _taken(way: Drive, starts: Stamps, span: int, period: int, run: DriveConfig) -> NDArray[np.bool_]:
+    """(S,) sweeps of `span` ns from `starts` on, one each `period` ns, that are recorded."""
     if not run.scans_at_stops:
         return np.ones(len(starts), bool)
     moved = np.interp(starts + span, way.stamps_ns, way.distance) - np.interp(starts, way.stamps_ns, way.distance)
-    every = np.arange(len(starts)) % max(AT_STOPS_NS // span, 1) == 0
+    every = np.arange(len(starts)) % max(AT_STOPS_NS // period, 1) == 0
     return np.asarray((moved < STANDS) & every)
 
 
@@ -185,7 +185,7 @@ def _trunks(
 ) -> Iterator[Event]:
     span = int(1e9 / sensor.sweep_hz)
     stamps = np.arange(int(way.stamps_ns[0]), int(way.stamps_ns[-1]), span, dtype=np.int64)
-    stamps = stamps[_taken(way, stamps, span, run)]
+    stamps = stamps[_taken(way, stamps, span, span, run)]
     poses: Array = way.at(stamps)
     for T, s in zip(poses, stamps.tolist(), strict=True):
 

@@ -168,7 +168,7 @@ def heading(drive: Drive, config: SensorConfig, fixes: Fixes, rng: np.random.Gen
 
 def columns(drive: Drive, config: SensorConfig, start_ns: int) -> Array:
     """world_T_lidar (columns, 4, 4) at each firing of the sweep that begins at `start_ns`."""
-    span_ns = int(1e9 / config.sweep_hz)
+    span_ns = int(1e9 * config.sweep_s)
     knots = start_ns + np.linspace(0, span_ns, 11).astype(np.int64)
     fine = start_ns + (np.arange(config.columns) * (span_ns / config.columns)).astype(np.int64)
     return interpolate(knots, drive.at(knots) @ mounting(config), fine)

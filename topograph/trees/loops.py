@@ -336,9 +336,10 @@ def tabulate(detections: Detections, track: NDArray[np.int64], map_T_scan: Array
         return np.asarray(np.bincount(track, x, minlength=n) / total)
 
     place = np.stack([mean(xy[:, k]) for k in range(2)], axis=1)
-    # What a source does not say of its noise, or of a path that is still bent, the track's own scatter does.
+    # The noise of recorded detections is a guess (they tell no kinds either); the track's own scatter is none.
     scatter = mean(0.5 * np.sum((xy - place[track]) ** 2, axis=1)) * total / np.maximum(total - 1, 1)
-    variance = np.maximum(mean(d.sigma**2), np.where(total >= SCATTERED, scatter, 0.0))
+    guessed = (mean(np.isnan(d.kinds[:, TREE]).astype(float)) > 0.5) & (total >= SCATTERED)
+    variance = np.maximum(mean(d.sigma**2), np.where(guessed, scatter, 0.0))
     first, last = np.full(n, np.inf), np.full(n, -np.inf)
     np.minimum.at(first, track, driven)
     np.maximum.at(last, track, driven)

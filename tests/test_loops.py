@@ -137,6 +137,7 @@ def test_scattered_trees_are_recognised_and_put_back(seed: int, x: float, y: flo
     found, here, is_tree = seen_again(rng, trees, np.array([x, y, yaw]))
     if found is None:  # undecided is allowed, wrong is not
         return
+    assert found.slid == 0.0  # no lattice
     beside = np.linalg.norm(trees[[j for _, j in found.pairs]] - trees[is_tree[[i for i, _ in found.pairs]]], axis=1)
     assert (beside > 0.5).sum() <= 1  # two that stand nearer may be taken for each other
     back = transform(moved_pose(np.eye(4), found.centre, found.move), np.column_stack([here, np.zeros(len(here))]))[

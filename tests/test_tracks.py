@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_estimate import problem
 
-from topograph.geometry import Array, planar, transform
-from topograph.trees import Tracker, TreesConfig, tabulate
+from topograph.geometry import Array, from_xyz_rpy, inverse, planar, transform, wrap, yaw_of
+from topograph.motion import Motion, MotionConfig
+from topograph.trees import Tracker, TreesConfig, follow, screen, tabulate
 from topograph.trees.whole import misstep
 
 GATE = TreesConfig().gate
@@ -77,6 +78,55 @@ def test_wheels_that_turn_too_far_do_not_break_tracks(doubt: float, tracks: int 
         assert all(len(names) == 1 for names in of.values())
     else:
         assert tracker.born > 2 * len(trees)
+
+
+@pytest.mark.parametrize(("period", "empty"), [(0.05, 0), (0.1, 0), (0.2, 0), (0.2, 3)])
+@pytest.mark.parametrize("tilt", [0.0, 0.15])
+def test_a_headland_by_wheels_that_turn_too_far(period: float, empty: int, tilt: float) -> None:
+    """4 m out, half a circle, 4 m back, at 1 m/s, by wheels that make a sixth more of turns; odometry begins elsewhere, turned and tilted. Tracks stay
+    whole and nothing seems to move, however often scans come and of however many some are empty; the path as tracks held it ends where the robot does.
+    """
+    rng = np.random.default_rng(0)
+    trees = np.column_stack([rng.uniform(-15, 45, (70, 2)) - [0, 15], np.zeros(70)])
+    s = np.arange(0.0, 8.0 + 3 * np.pi, period)
+    a = np.clip((s - 4.0) / 3.0, 0.0, np.pi)
+    before, after = np.clip(s, 0, 4), np.maximum(s - 4.0 - 3 * np.pi, 0.0)
+    world_T_robot = planar(before + 3 * np.sin(a) - after, 3 - 3 * np.cos(a), a)
+    step = inverse(world_T_robot[:-1]) @ world_T_robot[1:]
+    odom_T_robot = [planar(100.0, -50.0, 0.7) @ from_xyz_rpy(0, 0, 0, tilt, tilt / 2, 0)]
+    for T in step:
+        odom_T_robot.append(odom_T_robot[-1] @ planar(T[0, 3], T[1, 3], yaw_of(T) * 7 / 6))
+    n = len(s)
+    d = problem(world_T_robot, trees, 0.02, rng, reach=15.0).detections
+    d = replace(d, stamps_ns=(s * 1e9).astype(np.int64), free=np.zeros((0, 360), np.uint32))
+    if empty:
+        d = d.select(d.scan % (empty + 1) == 0)
+    motion = Motion(
+        stamps_ns=d.stamps_ns, odom_T_robot=np.array(odom_T_robot), distance=s, turned=a * 7 / 6, gyro=False, wheels=True
+    )  # fmt: skip
+    config = TreesConfig()
+    track, held_T_robot = follow(d, motion, config, MotionConfig())
+    which = np.argmin(np.linalg.norm(transform(world_T_robot[d.scan], d.p)[:, None] - trees, axis=2), axis=1)
+    for k in np.unique(track):
+        assert len(np.unique(which[track == k])) == 1
+    assert len(np.unique(track)) < 1.35 * len(np.unique(which))  # trees come back into view
+    assert screen(d, track, motion, held_T_robot).keep.mean() > 0.95
+    true, held, reckoned = (inverse(P[0]) @ P[n - 1] for P in (world_T_robot, held_T_robot, motion.odom_T_robot))
+    assert np.linalg.norm((reckoned - true)[:2, 3]) > 1.0
+    assert np.linalg.norm((held - true)[:2, 3]) < 0.5
+    assert abs(float(wrap(yaw_of(held) - yaw_of(true)))) < 0.1
+
+
+def test_tracks_are_not_held_by_wheels_that_are_none() -> None:
+    """Where fixes stand in for wheels, steps may be off by decimetres, and the path is theirs."""
+    rng = np.random.default_rng(6)
+    poses = planar(np.linspace(0, 8, 20), 0.0, 0.0)
+    d = problem(poses, np.array([[4.0, 3.0, 0.0], [4.0, -3.0, 0.0], [8.0, 3.0, 0.0]]), 0.03, rng).detections
+    motion = Motion(
+        stamps_ns=d.stamps_ns, odom_T_robot=poses, distance=np.linspace(0, 8, 20), turned=np.zeros(20), gyro=True, wheels=False
+    )  # fmt: skip
+    _, held = follow(d, motion, TreesConfig(), MotionConfig())
+    np.testing.assert_array_equal(held, poses)
 
 
 def test_a_track_is_as_uncertain_as_it_scatters() -> None:

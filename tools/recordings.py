@@ -221,11 +221,11 @@ def map_at(poses: Array, trunks: list[Trunks], config: Config) -> Mapped:
         gyro=True,
         wheels=True,
     )
-    track, _ = follow(d, motion, config.trees, config.motion)
-    keep = screen(d, track, motion).keep
+    track, held_T_robot = follow(d, motion, config.trees, config.motion)
+    keep = screen(d, track, motion, held_T_robot).keep
     d, track = d.select(keep), np.unique(track[keep], return_inverse=True)[1]
     seen = transform(poses[d.scan], d.p)
-    variance = 0.5 * (d.cov[:, 0, 0] + d.cov[:, 1, 1])
+    variance = d.sigma**2
     t = tabulate(d, track, poses, distance)
     tree = refine(t, np.arange(len(t.hits)), config.trees)[track]
     n = int(tree.max(initial=-1)) + 1

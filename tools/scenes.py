@@ -206,7 +206,7 @@ def _look(scene: Orchard, sensor: SensorConfig, seed: int, rng: np.random.Genera
     base_T_lidar = mounting(sensor)
     moving = rng.random() < 0.7
     twist = np.array([rng.uniform(0, 1.5), 0, 0, 0, 0, rng.normal(0, 0.2)]) * moving
-    span = 1.0 / sensor.sweep_hz
+    span = sensor.sweep_s
     t = (np.arange(sensor.columns) / sensor.columns - 1.0) * span  # stamped at its end
     turn = twist[5] * t
     step = np.stack([from_xyz_rpy(twist[0] * np.cos(0.5 * a) * k, twist[0] * np.sin(0.5 * a) * k, 0, 0, 0, a) for k, a in zip(t, turn, strict=True)])  # fmt: skip

@@ -33,6 +33,7 @@ class Solved:
         moving: share of the detections that were of things that moved or rode along.
         held_out: (H,) indices of the fixes withheld from the estimator.
         rejected: trees that did not exist.
+        loops: what became of them.
     """
 
     run: Session
@@ -145,9 +146,9 @@ def prepare(
     if screened:
         motion = with_trunks_way(motion, detections, streams.fix_ns)
     notes += _wheel_notes(motion)
-    track, moving, put_right = np.arange(len(detections)), 0.0, None
+    track, moving, held_T_robot = np.arange(len(detections)), 0.0, None
     if screened:
-        detections, track, moving, put_right = _screened(detections, motion, config, notes)
+        detections, track, moving, held_T_robot = _screened(detections, motion, config, notes)
     n_fix = len(run.streams.fix_ns)
     used = np.ones(n_fix, bool)
     if check_fixes > 0:
@@ -181,19 +182,19 @@ def prepare(
     if known is not None:
         problem = replace(problem, known=known.at(detections))
     return Prepared(
-        run=run, streams=streams, problem=problem, track=track, guess=_guess(problem, put_right), moving=moving,
+        run=run, streams=streams, problem=problem, track=track, guess=_guess(problem, held_T_robot), moving=moving,
         held_out=np.flatnonzero(~used),
     )  # fmt: skip
 
 
-def _guess(problem: Problem, world_T_odom: Array | None) -> Array | None:
-    """The path (K, 4, 4) without the steps that the trunks say it did not do, where it is dead reckoning's and nothing else holds it."""
-    if world_T_odom is None or len(problem.fixes.keyframe) or problem.known is not None:
-        return None
-    if (world_T_odom == np.eye(4)).all():
+def _guess(problem: Problem, held_T_robot: Array | None) -> Array | None:
+    """The path (K, 4, 4) as tracks held it, where it would begin as dead reckoning has it and that was put right; else None."""
+    if held_T_robot is None or len(problem.fixes.keyframe) or problem.known is not None:
         return None
     scans_ns = problem.detections.stamps_ns
-    return path_at(scans_ns, world_T_odom @ problem.motion.at(scans_ns), problem.motion, problem.stamps_ns)
+    if np.array_equal(held_T_robot, problem.motion.at(scans_ns)):
+        return None
+    return path_at(scans_ns, held_T_robot, problem.motion, problem.stamps_ns)
 
 
 def _wheel_notes(motion: Motion) -> list[str]:
@@ -235,14 +236,14 @@ def _covered(detections: Detections, motion: Motion, notes: list[str]) -> Detect
 def _screened(
     detections: Detections, motion: Motion, config: MappingConfig, notes: list[str]
 ) -> tuple[Detections, NDArray[np.int64], float, Array]:
-    """The detections that may be of landmarks, their tracks, numbered without gaps, the share of all that moved, and `follow`'s world_T_odom."""
-    track, world_T_odom = follow(detections, motion, config.trees, config.motion)
-    screened = screen(detections, track, motion)
+    """The detections that may be of landmarks, their tracks, numbered without gaps, the share of all that moved, and `follow`'s held_T_robot."""
+    track, held_T_robot = follow(detections, motion, config.trees, config.motion)
+    screened = screen(detections, track, motion, held_T_robot)
     if screened.moved:
         notes.append(f"{screened.moved} things that moved, or rode along with the robot, were left out")
     keep = screened.keep
     tracks = np.unique(track[keep], return_inverse=True)[1].astype(np.int64)
-    return detections.select(keep), tracks, screened.moving, world_T_odom
+    return detections.select(keep), tracks, screened.moving, held_T_robot
 
 
 def _or(pose: Array | None, other: Array) -> Array:

@@ -16,7 +16,7 @@ LEAST_BELIEVED = 0.05
 """Share of its information that a sighting keeps however little its scan believed in it: many such may still be a tree."""
 
 ALONG = 0.5
-"""m, along the axis: a trunk is seen at about the same height from everywhere."""
+"""m, along the axis, at worst: a trunk is seen at about the same height from everywhere."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,14 +64,15 @@ class Detections:
     @property
     def sigma(self) -> Array:
         """(N,) standard deviation, per axis, of where each axis stands in the robot's plane, m. Along itself an axis is known
-        to `ALONG` at least: a recorded detection does not say where on the trunk it lies, and metres along a leaning axis
+        to `ALONG` at worst: a recorded detection does not say where on the trunk it lies, and metres along a leaning axis
         would be as many decimetres on the ground.
         """
-        a = self.axis[:, :, None]
-        across = np.eye(3) - a * self.axis[:, None, :]
-        var = np.minimum(self.axis[:, None, :] @ self.cov @ a, ALONG**2)
-        cov = across @ self.cov @ across + var * a * self.axis[:, None, :]
-        return np.sqrt(0.5 * (cov[:, 0, 0] + cov[:, 1, 1]))
+        a, C = self.axis, self.cov
+        along = np.einsum("nij,nj->ni", C, a)  # C a
+        var = np.einsum("ni,ni->n", a, along)
+        flat = a[:, 0] ** 2 + a[:, 1] ** 2
+        across = C[:, 0, 0] + C[:, 1, 1] - 2.0 * np.sum(a[:, :2] * along[:, :2], axis=1) + flat * var
+        return np.asarray(np.sqrt(0.5 * np.maximum(across + flat * np.minimum(var, ALONG**2), 0.0)))
 
     @staticmethod
     def of(trunks: Iterable[Trunks]) -> Detections:

@@ -22,6 +22,8 @@ KNOTS = 500
 """Of a way, at most: the drift is asked for every few metres, and may reach back to the run's beginning."""
 SPAN = 6.0
 """m of a way that are looked at together: more than a slip, less than a headland and its alleys."""
+BIAS = 5e-4
+"""rad/s that a gyro's bias may be from its mean."""
 HELD = 15.0
 """m around a fix in which the fixes judge the path, and wheels that slip do not."""
 ASTRAY = 80.0
@@ -55,7 +57,7 @@ class _Sources(NamedTuple):
 
     Attributes:
         knots: (K+1,) m driven; `step` (K, 2) and `turn` (K,) between them.
-        yaw: (K, S) what each source turns each step by, rad.
+        yaw: (K, S) what each source that lasts turns each step by, rad; `own` (K,) what each step does by itself.
         scale: of the steps, the first source's.
         arms: (K, 3) what a turn of each step does to the piece, per rad.
         slips: (K,) m², per axis, that each step adds.
@@ -65,15 +67,22 @@ class _Sources(NamedTuple):
     step: Array
     turn: Array
     yaw: Array
+    own: Array
     scale: float
     arms: Array
     slips: Array
 
     def effect(self) -> Array:
-        """(3, S) what each source does to the piece."""
+        """(3, S) what each source that lasts does to the piece."""
         out = self.arms.T @ self.yaw
         out[:2, 0] = self.scale * self.step.sum(axis=0)
         return out
+
+    def cov(self) -> Array:
+        """(3, 3) of the piece."""
+        J, slips = self.effect(), self.slips.sum() + LEAST[0] ** 2
+        own = (self.arms.T * self.own**2) @ self.arms
+        return np.asarray(J @ J.T + own + np.diag([slips, slips, LEAST[1] ** 2]))
 
 
 def _sources(way: Way, since: float, until: float, centre: Array, motion: Motion, noise: MotionConfig) -> _Sources:
@@ -93,7 +102,7 @@ def _sources(way: Way, since: float, until: float, centre: Array, motion: Motion
         slips += doubt.sum() * doubt  # one slip, however finely it is looked at
     return _Sources(
         knots=knots, step=step, turn=turn, scale=SLACK * noise.along, slips=slips,
-        yaw=np.column_stack([np.zeros(len(d)), share * turn, straight * d, np.diag(np.sqrt(own))]),
+        yaw=np.column_stack([np.zeros(len(d)), share * turn, straight * d]), own=np.sqrt(own),
         arms=np.column_stack([-arm[:, 1], arm[:, 0], np.ones(len(d))]),
     )  # fmt: skip
 
@@ -104,10 +113,7 @@ def drift(way: Way, since: float, until: float, centre: Array, motion: Motion, n
     Scales of wheels and turns stay the same over a run: their errors are as large as the way there is long, or the turn wide, whatever
     lies between. An error of yaw shifts the piece by its distance from where it arose. What changes (slips, a gyro's bias) adds up in variance.
     """
-    s = _sources(way, since, until, centre, motion, noise)
-    J = s.effect()
-    slips = s.slips.sum() + LEAST[0] ** 2
-    return np.asarray(J @ J.T + np.diag([slips, slips, LEAST[1] ** 2]))
+    return _sources(way, since, until, centre, motion, noise).cov()
 
 
 def bent(way: Way, since: float, until: float, centre: Array, move: Array, motion: Motion, noise: MotionConfig) -> Way:
@@ -129,11 +135,9 @@ def bent(way: Way, since: float, until: float, centre: Array, move: Array, motio
 def _bent(way: Way, since: float, until: float, centre: Array, move: Array, motion: Motion, noise: MotionConfig) -> Way:
     """As `bent`, exact for small moves."""
     s = _sources(way, since, until, centre, motion, noise)
-    J = s.effect()
-    slips = s.slips.sum() + LEAST[0] ** 2
-    pull = np.linalg.solve(J @ J.T + np.diag([slips, slips, LEAST[1] ** 2]), move)
-    z = J.T @ pull
-    turned = np.concatenate([[0.0], np.cumsum(s.yaw @ z)])
+    pull = np.linalg.solve(s.cov(), move)
+    z = s.effect().T @ pull
+    turned = np.concatenate([[0.0], np.cumsum(s.yaw @ z + s.own**2 * (s.arms @ pull))])
     middle = planar(0.0, 0.0, 0.5 * (turned[1:] + turned[:-1]))[:, :2, :2]
     step = np.einsum("kij,kj->ki", middle, s.step * (1.0 + s.scale * z[0])) + s.slips[:, None] * pull[:2]
     old = way.at(s.knots)[:, :2]
@@ -163,6 +167,13 @@ def astray(path: Way, motion: Motion, odom_T_robot: Array, noise: MotionConfig, 
             continue
         a, b = (w.at(np.array([begin, begin + SPAN])) for w in (path, reckoned))
         cov = drift(reckoned, begin, begin + SPAN, b[1, :2], motion, noise)
+        if motion.gyro:  # whose bias turns it by seconds, also where the robot stands
+            lasted = (
+                float(np.ptp(np.interp([begin, begin + SPAN], motion.distance, motion.stamps_ns - motion.stamps_ns[0])))
+                * 1e-9
+            )
+            swing = np.array([-0.5 * SPAN, 0.5 * SPAN, 1.0])
+            cov = cov + (noise.yaw_rate**2 * lasted + (BIAS * lasted) ** 2) * np.diag(swing**2)
         off = _turned(_step(a) - _step(b), b[0, 2])
         off[2] = wrap(off[2])
         distance2 = float(off @ np.linalg.solve(cov, off))

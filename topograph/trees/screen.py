@@ -43,14 +43,14 @@ class Screened:
     moving: float
 
 
-def screen(detections: Detections, track: NDArray[np.int64], motion: Motion) -> Screened:
-    """Judge the tracks (N,) of `detections`."""
+def screen(detections: Detections, track: NDArray[np.int64], motion: Motion, held_T_robot: Array) -> Screened:
+    """Judge the tracks (N,) of `detections`, seen from `held_T_robot` (S, 4, 4), as `follow` has it: what the wheels put off is not what moves."""
     d = detections
     n = int(track.max(initial=-1)) + 1
     if n == 0:
         return Screened(np.zeros(0, bool), 0, 0, 0.0)
     # Where fixes stand in for wheels, what seems to move may be the robot.
-    moving = _moving(d, track, n, motion) if motion.wheels else np.zeros(n, bool)
+    moving = _moving(d, track, n, motion, held_T_robot) if motion.wheels else np.zeros(n, bool)
     doubted = np.zeros(n, bool)
     told = np.isfinite(d.kinds).all(axis=1)
     if told.any():
@@ -66,9 +66,9 @@ def screen(detections: Detections, track: NDArray[np.int64], motion: Motion) -> 
     )
 
 
-def _moving(d: Detections, track: NDArray[np.int64], n: int, motion: Motion) -> NDArray[np.bool_]:
+def _moving(d: Detections, track: NDArray[np.int64], n: int, motion: Motion, held_T_robot: Array) -> NDArray[np.bool_]:
     """Tracks (n,) of which two parts lie further apart than dead reckoning and a trunk explain."""
-    place = transform(motion.at(d.stamps_ns)[d.scan], d.p)[:, :2]
+    place = transform(held_T_robot[d.scan], d.p)[:, :2]
     far = np.linalg.norm(d.p[:, :2], axis=1)
     mean_far = (np.bincount(track, far, n) / np.maximum(np.bincount(track, minlength=n), 1))[track]
     bend = TURN_DRIFT if motion.gyro else TURN_DRIFT_WHEELS

@@ -59,14 +59,15 @@ class Tracker:
     """Follows trunks from scan to scan in the odometry frame, by gated optimal assignment; fed forwards, live and in batch.
 
     A track's place follows the newest sightings, so that it drifts with dead reckoning and not against it; where a step was off by more than
-    trees are known, all tracks are moved with it, and `world_T_odom` (4, 4), which starts as identity, adds up what it was. Tracks are named in the
+    trees are known, all tracks are moved with it, and `held_T_odom` (4, 4), which starts as identity, adds up what it was. Tracks are named in the
     order of their birth; what has not been seen for `config.forget` m is forgotten.
     """
 
     def __init__(self, config: TreesConfig) -> None:
         self.config = config
         self.born = 0
-        self.world_T_odom = np.eye(4)
+        self.held_T_odom = np.eye(4)
+        self._off = np.zeros(3)  # since the tracks were last moved
         self._ids: NDArray[np.int64] = np.zeros(0, np.int64)
         self._place, self._spread = np.zeros((0, 2)), np.zeros((0, 2, 2))
         self._seen, self._hits = np.zeros(0), np.zeros(0)
@@ -80,13 +81,16 @@ class Tracker:
         if not keep.all():
             self._ids, self._place, self._spread = self._ids[keep], self._place[keep], self._spread[keep]
             self._seen, self._hits = self._seen[keep], self._hits[keep]
+        self._off += off  # an error of scale is alike from scan to scan
         n = len(p)
         if n == 0:
             return np.zeros(0, np.int64)
-        self._keep_step(p, cov, var, distance, at, off)
+        self._keep_step(p, cov, var, distance, at)
         pairs, cost = gated(p, cov, self._place, self._spread, distance - self._seen, c.floor, c.drift, c.gate)
         match = assigned(pairs, cost, n, len(self._ids))
         seen_again(p, cov, match, self._place, self._spread, self._hits)
+        if (match >= 0).any():
+            self._off *= 1.0 - ABSORBED
         old, new = np.flatnonzero(match >= 0), np.flatnonzero(match < 0)
         self._seen[match[old]] = distance
         track = np.empty(n, np.int64)
@@ -99,10 +103,11 @@ class Tracker:
         self._hits = np.concatenate([self._hits, np.ones(len(new))])
         return track
 
-    def _keep_step(self, p: Array, cov: Array, var: Array, distance: float, at: Array, off: Array) -> None:
-        """Move the tracks with a step of dead reckoning that was off."""
-        c, arm = self.config, p - at
-        if max(off[0], off[1], off[2] * float(np.abs(arm).max())) < c.floor or not len(self._ids):
+    def _keep_step(self, p: Array, cov: Array, var: Array, distance: float, at: Array) -> None:
+        """Move the tracks with steps of dead reckoning that were off."""
+        c, arm, off = self.config, p - at, np.minimum(self._off, FARTHEST_OFF)
+        wide_enough = max(SIDEWAYS * off[0], SIDEWAYS * off[1], off[2] * float(np.abs(arm).max())) > c.floor
+        if not wide_enough or not len(self._ids):
             return
         turned = np.stack([-arm[:, 1], arm[:, 0]], axis=1)
         wide = cov + np.diag(off[:2] ** 2) + off[2] ** 2 * turned[:, :, None] * turned[:, None, :]
@@ -113,9 +118,10 @@ class Tracker:
         step = misstep(self._place[j] - p[i], arm[i], 2.0 * var[i] + c.floor**2, i, off, c.gate)
         if step is not None:
             to, back = planar(at[0] + step[0], at[1] + step[1], step[2]), planar(-at[0], -at[1], 0.0)
-            self.world_T_odom = self.world_T_odom @ to @ back
+            self.held_T_odom = self.held_T_odom @ to @ back
             R = planar(0.0, 0.0, -step[2])[:2, :2]
             self._place = np.ascontiguousarray((self._place - at - step[:2]) @ R.T + at)
+            self._off = np.zeros(3)
 
 
 def assigned(pairs: NDArray[np.int64], cost: Array, rows: int, columns: int) -> NDArray[np.int64]:
@@ -140,6 +146,12 @@ def assigned(pairs: NDArray[np.int64], cost: Array, rows: int, columns: int) -> 
     return match
 
 
+ABSORBED = 0.1
+"""Of what dead reckoning has gone off, that tracks take up with each scan: they follow the newest sightings (`seen_again`'s gain)."""
+FARTHEST_OFF = np.array([2.0, 2.0, 0.5])
+"""m and rad beyond which a scan is not laid onto tracks: another tree would do as well."""
+SIDEWAYS = 0.5
+"""Of a shift against a turn at the furthest trunk: wheels are off by a little always, and tracks follow."""
 FAR = 1e6
 """Cost of a pair that is none."""
 
@@ -147,11 +159,11 @@ FAR = 1e6
 def follow(
     detections: Detections, motion: Motion, config: TreesConfig, noise: MotionConfig
 ) -> tuple[NDArray[np.int64], Array]:
-    """Track (N,) of each detection, in the order of the scans, and `world_T_odom` (S, 4, 4), which takes steps out of dead reckoning that the
-    trunks say it did not do: a first guess, where the path would otherwise begin as dead reckoning left it.
+    """Track (N,) of each detection, in the order of the scans, and `held_T_robot` (S, 4, 4): dead reckoning at the scans without the steps that the
+    trunks say it did not do.
     """
     if not len(detections):
-        return np.zeros(0, np.int64), np.tile(np.eye(4), (len(detections.stamps_ns), 1, 1))
+        return np.zeros(0, np.int64), motion.at(detections.stamps_ns)
     odom_T_robot = motion.at(detections.stamps_ns)
     distance = motion.distance_at(detections.stamps_ns).tolist()
     p = np.ascontiguousarray(transform(odom_T_robot[detections.scan], detections.p)[:, :2])
@@ -163,8 +175,9 @@ def follow(
     sigma = motion.sigma(noise, detections.stamps_ns)
     along = np.maximum(sigma[:, 3], sigma[:, 4])
     off = np.concatenate([np.zeros((1, 3)), np.stack([along, along, sigma[:, 2]], axis=1)])
-    tracker, track, put_right = Tracker(config), [], []
+    tracker, track, held_T_odom = Tracker(config), [], []
     for a, b, d, *step in zip(ends[:-1], ends[1:], distance, at, off, strict=True):
         track.append(tracker.step(p[a:b], cov[a:b], var[a:b], d, *step))
-        put_right.append(tracker.world_T_odom)
-    return np.concatenate(track), np.array(put_right)
+        held_T_odom.append(tracker.held_T_odom)
+    held = np.array(held_T_odom) @ odom_T_robot if motion.wheels else odom_T_robot
+    return np.concatenate(track), held

@@ -5,12 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from topograph.geometry import Array
+from topograph.geometry import Array, planar
 
 LEAST = 3
 """Trunks that have to agree on a shift and a turn of the scan: two always do."""
 AGREED = 0.5
-"""Share of the trunks that could be matched by shifting the scan which have to agree on how."""
+"""Share of the trunks that could be matched by shifting the scan of which more have to agree on how: people who walk along are no majority."""
+NEAR = 9.0
+"""Squared deviations within which they agree: closer than a track's gate, in which two groups may both find themselves."""
+TRIED = 50
+"""Turns that are tried first, at most."""
 ROUNDS = 5
 """Of reweighting."""
 ARM = 2.0
@@ -29,15 +33,23 @@ def misstep(offset: Array, arm: Array, var: Array, trunk: NDArray[np.int64], sig
     far = square > ARM**2
     tried = np.append(np.sum(offset * turned, axis=1)[far] / square[far], 0.0)
     tried = tried[np.abs(tried) < 3.0 * sigma[2]]
-    left = offset[None] - tried[:, None, None] * turned
+    tried = tried[:: len(tried) // TRIED + 1]
+    left = offset[None] - _swept(arm, tried)
     support = (1.0 / (1.0 + np.sum(left**2, axis=2) / (gate * var))).sum(axis=1)
     x = np.array([0.0, 0.0, tried[np.argmax(support)]])
-    A = np.concatenate([np.tile(np.eye(2), (len(arm), 1, 1)), turned[:, :, None]], axis=2)
     for _ in range(ROUNDS):
-        e2 = np.sum((offset - A @ x) ** 2, axis=1) / var
-        w = 1.0 / (var * (1.0 + e2 / gate) ** 2)
-        x = np.linalg.solve(
-            np.einsum("k,kij,kil->jl", w, A, A) + np.diag(sigma**-2.0), np.einsum("k,kij,ki->j", w, A, offset)
-        )
-    agree = np.unique(trunk[np.sum((offset - A @ x) ** 2, axis=1) < gate * var])
-    return x if len(agree) >= max(LEAST, AGREED * len(np.unique(trunk))) else None
+        e = offset - x[:2] - _swept(arm, x[2:])[0]
+        w = 1.0 / (var * (1.0 + np.sum(e**2, axis=1) / var / gate) ** 2)
+        c, s = np.cos(x[2]), np.sin(x[2])
+        by_turn = turned @ np.array([[c, s], [-s, c]])
+        A = np.concatenate([np.tile(np.eye(2), (len(arm), 1, 1)), by_turn[:, :, None]], axis=2)
+        H = np.einsum("k,kij,kil->jl", w, A, A) + np.diag(sigma**-2.0)
+        x = x + np.linalg.solve(H, np.einsum("k,kij,ki->j", w, A, e) - x / sigma**2)
+    e = offset - x[:2] - _swept(arm, x[2:])[0]
+    agree = np.unique(trunk[np.sum(e**2, axis=1) < NEAR * var])
+    return x if len(agree) >= LEAST and len(agree) > AGREED * len(np.unique(trunk)) else None
+
+
+def _swept(arm: Array, turn: Array) -> Array:
+    """(T, K, 2) how far turns (T,) move what is at `arm` (K, 2)."""
+    return np.asarray(arm @ planar(0.0, 0.0, turn)[:, :2, :2].swapaxes(1, 2) - arm)

@@ -94,7 +94,8 @@ def parts_apart(
         rank < more * (size + 1), rank // (size + 1), more + (rank - more * (size + 1)) // np.maximum(size, 1)
     )
     group = label * GROUPS + part
-    place, spread = place[order], d.sigma[order]
+    # Wide on purpose (metres along a leaning axis are taken as they come): wheels that slip move still things, too.
+    place, spread = place[order], np.sqrt(0.5 * (d.cov[order, 0, 0] + d.cov[order, 1, 1]))
     middle = np.stack([_medians(place[:, k], group, n * GROUPS) for k in range(2)], axis=1).reshape(n, GROUPS, 2)
     way = _medians(drift[order], group, n * GROUPS).reshape(n, GROUPS)
     sigma = _medians(spread, label, n)[long]

@@ -106,8 +106,7 @@ class Tracker:
     def _keep_step(self, p: Array, cov: Array, var: Array, distance: float, at: Array) -> None:
         """Move the tracks with steps of dead reckoning that were off."""
         c, arm, off = self.config, p - at, np.minimum(self._off, FARTHEST_OFF)
-        wide_enough = max(SIDEWAYS * off[0], SIDEWAYS * off[1], off[2] * float(np.abs(arm).max())) > c.floor
-        if not wide_enough or not len(self._ids):
+        if max(off[0], off[1], off[2] * float(np.abs(arm).max())) < c.floor or not len(self._ids):
             return
         turned = np.stack([-arm[:, 1], arm[:, 0]], axis=1)
         wide = cov + np.diag(off[:2] ** 2) + off[2] ** 2 * turned[:, :, None] * turned[:, None, :]
@@ -150,8 +149,6 @@ ABSORBED = 0.1
 """Of what dead reckoning has gone off, that tracks take up with each scan: they follow the newest sightings (`seen_again`'s gain)."""
 FARTHEST_OFF = np.array([2.0, 2.0, 0.5])
 """m and rad beyond which a scan is not laid onto tracks: another tree would do as well."""
-SIDEWAYS = 0.5
-"""Of a shift against a turn at the furthest trunk: wheels are off by a little always, and tracks follow."""
 FAR = 1e6
 """Cost of a pair that is none."""
 

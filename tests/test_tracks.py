@@ -61,7 +61,7 @@ def test_wheels_that_turn_too_far_do_not_break_tracks(doubt: float, tracks: int 
         seen = np.flatnonzero(rng.random(len(trees)) < 0.8)
         p = moved(trees[seen], np.array([0.0, 0.0, -yaw])) + rng.normal(0, 0.02, (len(seen), 2))
         reckoned = moved(p, np.array([0.0, 0.0, 1.2 * yaw]))
-        off = np.array([0.01, 0.01, 1.2 * doubt * (turn[1] - turn[0]) * 1.2 if k else 0.0])
+        off = np.array([0.005, 0.005, 1.44 * (turn[1] - turn[0])]) * doubt
         for i, name in zip(
             seen,
             tracker.step(

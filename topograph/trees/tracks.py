@@ -105,7 +105,7 @@ class Tracker:
 
     def _keep_step(self, p: Array, cov: Array, var: Array, distance: float, at: Array) -> None:
         """Move the tracks with steps of dead reckoning that were off."""
-        c, arm, off = self.config, p - at, np.minimum(self._off, FARTHEST_OFF)
+        c, arm, off = self.config, p - at, np.clip(self._off, 1e-6, FARTHEST_OFF)
         if max(off[0], off[1], off[2] * float(np.abs(arm).max())) < c.floor or not len(self._ids):
             return
         turned = np.stack([-arm[:, 1], arm[:, 0]], axis=1)

@@ -60,6 +60,7 @@ class Prepared:
         streams: the small streams as they are used: without nonsense, clocks set right.
         problem: with all detections, and no sightings yet.
         track: (N,) track of each detection.
+        guess: (K, 4, 4) the path to begin from, as tracks held it, or None.
         moving: share of the detections that were of things that moved or rode along.
         held_out: (H,) indices of the fixes withheld from the estimator.
     """

@@ -81,8 +81,8 @@ class SensorConfig:
         mount: base_T_lidar as x, y, z, roll, pitch, yaw; None: that of `sensors.MOUNTS`.
         ring_bias: sigma of each laser's constant range error; `from_top`: rings are counted from the top.
         mast: a mast stands on the robot at (-0.6, 0.3); `twice`: each return is reported twice.
-        sweep_hz, columns: sweeps per second that are recorded; firings per sweep. A LiDAR turns at `SLOWEST_HZ` at least: fewer sweeps are
-            every so manieth one, not slower ones.
+        sweep_hz, columns: sweeps per second that are recorded; firings per sweep. A LiDAR turns at `SLOWEST_HZ` at least: where fewer
+            sweeps are recorded, some are left out, none is slower.
         range_sigma, max_range, dropout: of one return; `bark` scales the roughness of trunks.
         divergence: half angle of the beam, rad (mixed pixels at edges).
         gyro_density, accel_density, gyro_bias, accel_bias, vibration: XSens MTi-300 (thesis 5.1) on a rolling robot.

@@ -74,7 +74,8 @@ class Tracker:
 
     def step(self, p: Array, cov: Array, var: Array, distance: float, at: Array, off: Array) -> NDArray[np.int64]:
         """Track (N,) of each trunk of one scan at `p` (N, 2) with `cov` (N, 2, 2), after `distance` m driven, seen from `at` (2,). `var` (N,) is what
-        is known of each at its own height, m² per axis; a leaning one may be looked for further away. `off` (3,) is how far dead reckoning may be off since the last scan: x, y, m, and yaw, rad, standard deviations.
+        is known of each at its own height, m² per axis; a leaning one may be looked for further away. `off` (3,) is how far
+        dead reckoning may be off since the last scan: x, y, m, and yaw, rad, standard deviations.
         """
         c = self.config
         keep = distance - self._seen < c.forget

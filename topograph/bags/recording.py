@@ -344,7 +344,8 @@ class Recording:
             message: Any = reader.deserialize(raw, typ)
             if kind == "points":
                 scan = decode_scan(message, decode.stamp_of(message.header))
-                if not np.isfinite(scan.xyz).all(axis=1).any():
+                finite = np.isfinite(scan.xyz)
+                if not (finite[:, 0] & finite[:, 1] & finite[:, 2]).any():
                     self._count(f"points: {EMPTY}")
                     return None
                 return scan

@@ -263,13 +263,18 @@ def results_folder(folder: Path | None) -> Iterator[Path]:
         part.replace(link)
 
 
+HASHED_AT_ONCE = 1 << 18
+"""Bytes of a file: what the processor keeps near."""
+
+
 def hash_of(path: Path, stop: threading.Event) -> str:
     """SHA-256 of a file, or of a folder's files in order of name; of what was read until `stop`."""
     h = hashlib.sha256()
+    block = memoryview(bytearray(HASHED_AT_ONCE))
     for p in [path] if path.is_file() else sorted(q for q in path.rglob("*") if q.is_file()):
-        with p.open("rb") as f:
-            while not stop.is_set() and (block := f.read(1 << 22)):
-                h.update(block)
+        with p.open("rb", buffering=0) as f:
+            while not stop.is_set() and (n := f.readinto(block)):
+                h.update(block[:n])
     return h.hexdigest()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,8 +98,8 @@ class Association:
         """An estimate without covariances of the trees as they are now; `patient`: until it has converged."""
         if link is not None:  # pull the loop shut with the trees as they were, then join them
             e = graph.solve(replace(self.problem, start=e.map_T_robot, link=link), self.config.estimate, quick=True)
-        self.problem, _, _ = self.with_trees(self.tree_of_track, least)
-        self.problem = replace(self.problem, start=e.map_T_robot)
+        tree, ids = self.trees(self.tree_of_track, least)
+        self.problem = replace(self.of_trees(ids), sightings=self.seen.gather(tree), start=e.map_T_robot)
         return graph.solve(self.problem, self.config.estimate, quick=True, patient=patient)
 
     def named(self, tree: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -119,7 +120,7 @@ class Association:
         t = self.table(e)
         self.tree_of_track = self.named(refine(t, self.tree_of_track, c))
         map_T_scan = self.poses(e)
-        _, tree, ids = self.with_trees(self.tree_of_track, 1)
+        tree, ids = self.trees(self.tree_of_track, 1)
         seen = transform(map_T_scan[d.scan], d.p)
         count = np.maximum(np.bincount(tree, minlength=len(ids)), 1)
         places = np.stack([np.bincount(tree, seen[:, k], minlength=len(ids)) / count for k in range(3)], axis=1)
@@ -128,7 +129,8 @@ class Association:
         keep[ids[found.ok]] = True
         if self.problem.known is not None:  # what the map knows exists, however rarely this run saw it
             keep[self.tree_of_track[self.tracks :]] = True
-        problem, tree, final = self.with_trees(self.tree_of_track, 1, keep)
+        tree, final = self.trees(self.tree_of_track, 1, keep)
+        problem = self.of_trees(final)
         # A known map states its trees at one height, whatever their stems.
         whole = None if problem.known is None else problem.known.tree[problem.known.tree >= 0]
         shape = shapes(d, tree, map_T_scan, len(final), whole)
@@ -137,10 +139,10 @@ class Association:
         problem = replace(problem, start=e.map_T_robot, detections=own, sightings=sightings)
         return Decided(tree, problem, found.select(np.searchsorted(ids, final)), shape, int((~found.ok).sum()))
 
-    def with_trees(
+    def trees(
         self, tree_of_track: NDArray[np.int64], least: int, keep: NDArray[np.bool_] | None = None
-    ) -> tuple[Problem, NDArray[np.int64], NDArray[np.int64]]:
-        """Problem, tree (N,) of each detection and former name (T,) of each tree, for trees of `least` detections."""
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Tree (N,) of each detection, -1 none, and the name (T,) of each tree, for trees of `least` detections."""
         tree = tree_of_track[self.track]
         size = int(tree_of_track.max(initial=-1)) + 1
         hits = np.bincount(tree, minlength=size)
@@ -148,12 +150,23 @@ class Association:
         if keep is not None:
             exists_ &= keep
         ids = np.flatnonzero(exists_)
-        name = np.full(size, -1, np.int64)
-        name[ids] = np.arange(len(ids))
-        tree = name[tree]
+        return _row(ids, size)[tree], ids
+
+    def of_trees(self, ids: NDArray[np.int64]) -> Problem:
+        """The problem of the trees (T,) of these names, with sightings still of others."""
         p = self.problem
-        known = None if p.known is None else replace(p.known, tree=name[tree_of_track[self.tracks :]])
-        return replace(p, sightings=self.seen.gather(tree), n_trees=len(ids), tree_ids=ids, known=known), tree, ids
+        known = p.known
+        if known is not None:
+            row = _row(ids, int(self.tree_of_track.max(initial=-1)) + 1)
+            known = replace(known, tree=row[self.tree_of_track[self.tracks :]])
+        return replace(p, n_trees=len(ids), tree_ids=ids, known=known)
+
+
+def _row(ids: NDArray[np.int64], size: int) -> NDArray[np.int64]:
+    """Where each of 0..size-1 stands among `ids`; -1 nowhere."""
+    row = np.full(size, -1, np.int64)
+    row[ids] = np.arange(len(ids))
+    return row
 
 
 def associate_and_solve(
@@ -186,17 +199,23 @@ def associate_and_solve(
         if not np.array_equal(a.tree_of_track, before):
             estimate = a.solve(estimate, patient=True)
     progress("solve", 0.0)
+    del a.seen  # as large as the detections, and from here on each decision makes its own
     after = a.decide(estimate)
+    earlier: list[_Made] = []
     for n in range(LAST_ROUNDS if config.trees.reassociate else 1):
         decided = after
         estimate = replace(graph.solve(decided.problem, config.estimate), tree=decided.tree)
         progress("solve", (n + 1) / LAST_ROUNDS)
         after = a.decide(estimate)
-        if _settled(after, decided):
+        made, former = _Made.of(after), _Made.of(decided)
+        if made.like(former):
             turned = np.abs(after.shapes.slope - decided.shapes.slope).max(initial=0.0)
             decided = replace(decided, shapes=after.shapes)  # as the last path has them
             if turned < SETTLED:
                 break
+        elif any(made.like(m) for m in earlier):  # a track goes to and fro between two trees, and would for ever
+            break
+        earlier.append(former)
     progress("solve", 1.0)
     return decided, estimate, a.closer.result
 
@@ -205,12 +224,22 @@ FLIPS = 1e-4
 """Share of the detections that may go to and fro between two trees: nothing moves by them."""
 
 
-def _settled(after: Decided, before: Decided) -> bool:
-    """The same trees, made of the same detections."""
-    if not np.array_equal(after.problem.tree_ids, before.problem.tree_ids):
-        return False
-    flips = int((after.tree != before.tree).sum())
-    return flips <= FLIPS * len(after.tree) and np.array_equal(after.shapes.forked, before.shapes.forked)
+class _Made(NamedTuple):
+    """What a decision made: names (T,) of the trees, which of them are forked, and the tree (N,) of each detection."""
+
+    ids: NDArray[np.int64]
+    forked: NDArray[np.bool_]
+    tree: NDArray[np.int64]
+
+    @staticmethod
+    def of(decided: Decided) -> _Made:
+        return _Made(decided.problem.names(), decided.shapes.forked, decided.tree)
+
+    def like(self, other: _Made) -> bool:
+        """The same trees, made of the same detections."""
+        if not (np.array_equal(self.ids, other.ids) and np.array_equal(self.forked, other.forked)):
+            return False
+        return int((self.tree != other.tree).sum()) <= FLIPS * len(self.tree)
 
 
 LAST_ROUNDS = 8

@@ -68,7 +68,7 @@ def spread(m: Array, cov: Array) -> Array:
     J[0::2, 2], J[1::2, 2] = -d[:, 1], d[:, 0]
     w = 1.0 / np.maximum(np.diag(cov), 1e-8)
     S = np.eye(2 * n) - J @ np.linalg.solve((J.T * w) @ J + 1e-9 * np.eye(3), J.T * w)
-    v = np.einsum("ij,jk,ik->i", S, cov, S)
+    v = np.sum((S @ cov) * S, axis=1)
     return np.asarray(np.maximum(0.5 * (v[0::2] + v[1::2]), 1e-6))
 
 

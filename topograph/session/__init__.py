@@ -1,5 +1,6 @@
 """One run: what it is called, its mountings, its streams as columns. The only thing the rooms above are handed."""
 
+from topograph.session.columns import picked
 from topograph.session.journal import Journal, Journaled
 from topograph.session.scans import ROWS, SECTORS, Scans, ScansBuilder
 from topograph.session.session import Session, unknown_mounts
@@ -15,5 +16,6 @@ __all__ = [
     "Session",
     "Streams",
     "StreamsBuilder",
+    "picked",
     "unknown_mounts",
 ]

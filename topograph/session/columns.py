@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,19 @@ def rising(stamps_ns: Stamps) -> NDArray[np.int64]:
     """Rows (K,) of stamps (N,) in the order of time, each stamp once: the first that came."""
     order = np.argsort(stamps_ns, kind="stable")
     return order[np.diff(stamps_ns[order], prepend=-(2**62)) > 0]
+
+
+def alike(values: NDArray[Any]) -> bool:
+    """Whether one value stands for all of a column (`np.broadcast_to`): what a source does not tell takes no memory."""
+    return len(values) > 0 and values.strides[0] == 0
+
+
+def picked(values: NDArray[Any], rows: NDArray[Any]) -> NDArray[Any]:
+    """`values[rows]`, rows as a mask (N,) or as indices; a column of which one value stands for all stays one."""
+    if not alike(values):
+        return np.asarray(values[rows])
+    count = int(rows.sum()) if rows.dtype == bool else len(rows)
+    return np.broadcast_to(values[0], (count, *values.shape[1:]))
 
 
 class Column:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from topograph.bags import Trunks
 from topograph.geometry import Array, Stamps
-from topograph.session.columns import rising
+from topograph.session.columns import alike, picked, rising
 
 SECTORS = 360
 """Words of a scan's record of passage (trunks/passage.py)."""
@@ -119,7 +119,7 @@ class Scans(Sequence[Trunks]):
             points=self.points[_ranges(self.cloud_ends[:-1][row], size)],
             cloud_ends=_sum(size),
             given=self.given[scans],
-            **{k: getattr(self, k)[row] for k in ROWS},
+            **{k: picked(getattr(self, k), row) for k in ROWS},
         )
 
     @staticmethod
@@ -130,6 +130,13 @@ class Scans(Sequence[Trunks]):
         scans, rows, points = (sum(q) for q in zip(*((len(q), len(q.p), len(q.points)) for q in parts), strict=True))
         told = any(len(q.free) for q in parts)
         length = {"points": points, "free": scans * told, **dict.fromkeys(_SCANS, scans), **dict.fromkeys(ROWS, rows)}
+        same = {
+            k: np.broadcast_to(v, (rows, *v.shape))
+            for k in ROWS
+            if (v := _same([getattr(q, k) for q in parts])) is not None
+        }
+        for k in same:
+            del length[k]
         whole = {k: np.zeros((n, *(v := getattr(parts[0], k)).shape[1:]), v.dtype) for k, n in length.items()}
         at = dict.fromkeys(length, 0)
         frames: list[str] = []
@@ -144,10 +151,18 @@ class Scans(Sequence[Trunks]):
             count.append(np.diff(q.ends))
             size.append(np.diff(q.cloud_ends))
         ends, cloud_ends = _sum(np.concatenate(count)), _sum(np.concatenate(size))
-        return Scans(frames=tuple(frames), ends=ends, cloud_ends=cloud_ends, **whole)
+        return Scans(frames=tuple(frames), ends=ends, cloud_ends=cloud_ends, **whole, **same)
 
 
 _SCANS = ("stamps_ns", "eye", "given")
+
+
+def _same(parts: list[NDArray[Any]]) -> NDArray[Any] | None:
+    """The value that stands for all rows of all parts, if there is one."""
+    parts = [v for v in parts if len(v)]
+    if not parts or not all(alike(v) and np.array_equal(v[0], parts[0][0], equal_nan=True) for v in parts):
+        return None
+    return np.array(parts[0][0])
 
 
 def _sum(count: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -199,6 +214,8 @@ class ScansBuilder:
 
 def _columns(trunks: Sequence[Trunks]) -> Scans:
     def rows(name: str, *shape: int, missing: float = 0.0) -> Array:
+        if not any(len(getattr(t, name)) for t in trunks):
+            return np.broadcast_to(np.full(shape, missing), (sum(map(len, trunks)), *shape))
         parts = [np.zeros((0, *shape))]
         for t in trunks:
             part = np.asarray(getattr(t, name), float)
@@ -215,11 +232,12 @@ def _columns(trunks: Sequence[Trunks]) -> Scans:
         if looked:
             free[k] = t.free
     clouds = [c for t in trunks for c in (t.clouds or [_NOTHING] * len(t))]
+    p, stems = rows("p", 3), rows("stems", missing=1.0)
     return Scans(
         stamps_ns=np.array([t.stamp_ns for t in trunks], np.int64),
         frames=tuple(t.frame for t in trunks),
         ends=_sum(np.array([len(t) for t in trunks], np.int64)),
-        p=rows("p", 3),
+        p=p,
         axis=rows("axis", 3),
         diameter=rows("diameter"),
         cov=rows("cov", 3, 3),
@@ -227,7 +245,7 @@ def _columns(trunks: Sequence[Trunks]) -> Scans:
         score=rows("score"),
         kinds=rows("kinds", 3, missing=np.nan),
         measured=rows("measured", 6),
-        stems=rows("stems", missing=1.0).astype(np.int64),
+        stems=np.broadcast_to(np.int64(1), len(p)) if alike(stems) else stems.astype(np.int64),
         free=free if any(len(t.free) == SECTORS for t in trunks) else free[:0],
         eye=np.array([t.eye for t in trunks], float).reshape(-1, 3),
         points=np.concatenate([_NOTHING, *clouds]).astype(np.float32, copy=False),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from topograph.bags import Trunks
 from topograph.geometry import Array, Stamps
-from topograph.session import ROWS, Scans
+from topograph.session import ROWS, Scans, picked
 
 LEAST_BELIEVED = 0.05
 """Share of its information that a sighting keeps however little its scan believed in it: many such may still be a tree."""
@@ -89,4 +89,4 @@ class Detections:
 
     def select(self, keep: NDArray[np.bool_]) -> Detections:
         """The detections where `keep` (N,); all scans stay."""
-        return replace(self, **{k: getattr(self, k)[keep] for k in ("scan", "source", *ROWS)})
+        return replace(self, **{k: picked(getattr(self, k), keep) for k in ("scan", "source", *ROWS)})

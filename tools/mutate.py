@@ -77,7 +77,7 @@ BREAKS = [
     Break("kinds are certain", T + "trees/existence.py", "DECEIVED = 0.03", "DECEIVED = 0.0", "tests/test_screen.py"),
     Break("track gate times 100", T + "trees/tracks.py", "gate: Positive = 11.8", "gate: Positive = 1180.0", NUMBERS + " -k 'right or clutter'"),
     Break("sightings count as independent", T + "trees/sightings.py", "independent: float = 0.25", "independent: float = 1.0", NUMBERS + " -k 'alike'"),
-    Break("clock of scans has the other sign", T + "estimate/graph.py", "mount[:, :, 0] = -s.late", "mount[:, :, 0] = s.late", P + "test_audit.py"),
+    Break("clock of scans has the other sign", T + "estimate/offsets.py", "mount[:, :, 0] = -s.late", "mount[:, :, 0] = s.late", P + "test_audit.py"),
     Break("existence ignores what should be seen", T + "trees/existence.py", "ok &= _shown_often(scan[anew], which[anew], p[anew], seen[anew], hits, n, config)", "pass", NUMBERS + " -k 'clutter'"),
     Break("views never disagree", T + "trees/shape.py", "out.place_var[:] = places.variance()", "pass", P + "test_shape.py"),
     Break("lever arm sign in assemble", T + "estimate/assemble.py", "lever = transform(keyframe_T_robot, robot_T_antenna[:3, 3])", "lever = transform(keyframe_T_robot, -robot_T_antenna[:3, 3])", NUMBERS + " -k 'right'"),
@@ -108,7 +108,7 @@ BREAKS = [
     Break("recall always 1", T + "evaluate/metrics.py", "float(seen[j].sum() / max(seen.sum(), 1))", "1.0", NUMBERS + " -k 'metrics_tell'"),
     Break("NEES of the wrong axis", T + "evaluate/metrics.py", 'np.einsum("ni,nij,nj->n", e[:, :2], np.linalg.inv(c), e[:, :2])', 'np.einsum("ni,nij,nj->n", e[:, :2], np.linalg.inv(c), 0 * e[:, :2])', NUMBERS + " -k 'metrics_tell'"),
     Break("the audit is silent", T + "pipeline/auditing.py", "return Verdict(tuple(sorted(", "return Verdict() if found else Verdict(tuple(sorted(", f"{P}test_cli.py -k refused"),
-    Break("a score test's sign", T + "estimate/graph.py", "moved = np.concatenate([(R @ f.late[:, :, None]), R[:, :, :2]], axis=2)", "moved = np.concatenate([(R @ f.late[:, :, None]), -R[:, :, :2]], axis=2)", P + "test_audit.py"),
+    Break("a score test's sign", T + "estimate/offsets.py", "moved = np.concatenate([(R @ f.late[:, :, None]), R[:, :, :2]], axis=2)", "moved = np.concatenate([(R @ f.late[:, :, None]), -R[:, :, :2]], axis=2)", P + "test_audit.py"),
     Break("the radial error is the tangential one", T + "trunks/fit.py", "out[i, 0, 0] = radial * c * c + tangential * s * s + lever", "out[i, 0, 0] = radial * s * s + tangential * c * c + lever", P + "test_trunks.py"),
 ]  # fmt: skip
 

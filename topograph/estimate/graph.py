@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Container, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,30 +21,17 @@ import factors
 from factors import Kernel
 from topograph.errors import InsufficientDataError
 from topograph.estimate import covariance
+from topograph.estimate.generator import B, L, Pass, V, X, fix_cov, graph_of, orthonormal
 from topograph.estimate.inertia import Inertia, inertia
 from topograph.estimate.initial import initial_path, yaw_of_direction
-from topograph.estimate.problem import Estimate, EstimateConfig, Offset, Problem
+from topograph.estimate.offsets import tested
+from topograph.estimate.problem import Estimate, EstimateConfig, Problem
 from topograph.estimate.solver import optimised, ordering_of, with_big_stack
 from topograph.geometry import Array, Stamps, inverse, log, transform, wrap
 from topograph.trees import Sightings
 
-X, V, B, L, C = (gtsam.symbol(c, 0) for c in "xvblc")
 _NONE = Kernel("none")
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Pass:
-    """Losses and noise of one solve: least deviation of a fix (m), factors on the noise of trunks and fixes, the
-    part of the trunks' that the likeness of neighbours makes, and the deviation of the trees' heights about where they begin (m)."""
-
-    trunk: Kernel
-    fix: Kernel
-    fix_floor: float = 0.0
-    trunk_scale: float = 1.0
-    fix_scale: float = 1.0
-    alike: float = 1.0
-    height: float = 100.0
 
 
 RELEARNT, STALE = 4, 0.6
@@ -56,12 +44,39 @@ QUICK_HEIGHT = 0.3
 free, the height takes up what the range is off by, in steps of metres that Gauss-Newton overshoots."""
 
 
-def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False, patient: bool = False) -> Estimate:
-    """Path and trees of a run, or InsufficientDataError: whatever GTSAM stumbles over is that the data contradict each other or do not
-    determine the path. See `_solve`.
+@dataclass(frozen=True, slots=True)
+class Converged:
+    """A solve before its last, exact steps: `estimate` has path and trees, and no covariances yet.
+
+    Attributes:
+        problem: with the sightings that were used.
+        last: losses and noise of the last pass.
+        values: GTSAM's.
+        began: of `time.perf_counter`.
     """
+
+    problem: Problem
+    last: Pass
+    inert: Inertia | None
+    values: Any
+    estimate: Estimate
+    began: float
+
+
+def solve(problem: Problem, config: EstimateConfig) -> Estimate:
+    """Path and trees of a run with their covariances.
+
+    Raises:
+        InsufficientDataError: the data contradict each other or do not determine the path.
+    """
+    return finish(converge(problem, config), config)
+
+
+@contextmanager
+def _determined() -> Iterator[None]:
+    """Whatever GTSAM stumbles over is that the data contradict each other or do not determine the path."""
     try:
-        return _solve(problem, config, quick=quick, patient=patient)
+        yield
     except (RuntimeError, IndexError, ValueError, np.linalg.LinAlgError) as err:
         first = (str(err).strip().splitlines() or [type(err).__name__])[0]
         _log.debug("the solve failed", exc_info=True)
@@ -70,35 +85,27 @@ def solve(problem: Problem, config: EstimateConfig, *, quick: bool = False, pati
         ) from err
 
 
-def _solve(problem: Problem, config: EstimateConfig, *, quick: bool, patient: bool) -> Estimate:
-    """Path and trees of a run. `quick` stops after a Huber pass of few steps and gives no covariances (for association);
-    with `patient` that pass runs until it has converged.
-
-    Raises:
-        InsufficientDataError: the data do not determine the path.
-    """
+@_determined()
+def quick(problem: Problem, config: EstimateConfig, *, patient: bool = False) -> Estimate:
+    """As `solve`, for association: one Huber pass of few steps, or `patient`, until it has converged; no covariances."""
     began = time.perf_counter()
-    if problem.start is None:
-        poses = _poses_alone(problem, initial_path(problem), config)
-    else:
-        poses = problem.start
-    trees = _median_trees(problem, poses)
+    problem, values = _begun(problem, config, config.quick_sightings, None)
     huber = Kernel("huber", config.huber)
-    inert = None if quick or not config.use_imu else inertia(problem)
-    most = config.quick_sightings if quick else config.most_sightings
-    problem = replace(problem, sightings=_nearest(problem.sightings, most))
-    values = _values(problem, poses, trees, inert)
-    first = (
-        Pass(trunk=huber, fix=huber, fix_floor=0.05, height=QUICK_HEIGHT)
-        if quick
-        else Pass(trunk=huber, fix=huber, fix_floor=0.0)
-    )
-    steps, tolerance = (3 * config.iterations, 1e-6)
-    if quick:
-        steps, tolerance = (3 * config.iterations, 1e-5) if patient else (10, 1e-3)
-    values = optimised(graph_of(problem, first, config, inert), values, steps, tolerance)
-    if quick:
-        return _estimate(problem, config, values, first, None, time.perf_counter() - began)
+    first = Pass(trunk=huber, fix=huber, fix_floor=0.05, height=QUICK_HEIGHT)
+    steps, tolerance = (3 * config.iterations, 1e-5) if patient else (10, 1e-3)
+    values = optimised(graph_of(problem, first, config, None), values, steps, tolerance)
+    return _estimate(problem, config, values, first, None, time.perf_counter() - began)
+
+
+@_determined()
+def converge(problem: Problem, config: EstimateConfig) -> Converged:
+    """The robust passes of `solve`. Raises as it does."""
+    began = time.perf_counter()
+    inert = inertia(problem) if config.use_imu else None
+    problem, values = _begun(problem, config, config.most_sightings, inert)
+    huber = Kernel("huber", config.huber)
+    first = Pass(trunk=huber, fix=huber, fix_floor=0.0)
+    values = optimised(graph_of(problem, first, config, inert), values, 3 * config.iterations, 1e-6)
     scales = _learned_scales(problem, values, first) if config.learn_scale else (1.0, 1.0, 1.0)
     tukey = Kernel("tukey", config.tukey)
     last = Pass(trunk=tukey, fix=tukey, trunk_scale=scales[0], fix_scale=scales[1], alike=scales[2])
@@ -110,15 +117,32 @@ def _solve(problem: Problem, config: EstimateConfig, *, quick: bool, patient: bo
         less = (min(scales[0], last.trunk_scale), min(scales[1], last.fix_scale))
         last = replace(last, trunk_scale=less[0], fix_scale=less[1], alike=scales[2])
         values = optimised(graph_of(problem, last, config, inert), values, config.iterations)
-    values, linear = with_big_stack(lambda: _polish(problem, last, config, inert, values))
-    out = _estimate(problem, config, values, last, linear, time.perf_counter() - began)
+    estimate = _estimate(problem, config, values, last, None, time.perf_counter() - began)
+    return Converged(problem, last, inert, values, estimate, began)
+
+
+@_determined()
+def finish(c: Converged, config: EstimateConfig) -> Estimate:
+    """The exact steps of `solve`, covariances, and the tests of what is taken as given. Raises as it does."""
+    values, linear = with_big_stack(lambda: _polish(c.problem, c.last, config, c.inert, c.values))
+    out = _estimate(c.problem, config, values, c.last, linear, 0.0)
     del linear  # as large as the graph: the tests make one of their own
     try:
-        tested = with_big_stack(lambda: _tested(problem, last, config, inert, values))
+        offsets = with_big_stack(lambda: tested(c.problem, c.last, config, c.inert, values, out.map_T_robot, out.trees))
     except (RuntimeError, IndexError, np.linalg.LinAlgError):  # the estimate stands without them
         _log.warning("clocks and mountings could not be tested", exc_info=True)
-        tested = ()
-    return replace(out, offsets=tested, seconds=time.perf_counter() - began)
+        offsets = ()
+    return replace(out, offsets=offsets, seconds=time.perf_counter() - c.began)
+
+
+def _begun(problem: Problem, config: EstimateConfig, most: int, inert: Inertia | None) -> tuple[Problem, Any]:
+    """The problem with at most so many sightings of each keyframe, and the values to begin from."""
+    poses = problem.start
+    if poses is None:
+        poses = _poses_alone(problem, initial_path(problem), config)
+    trees = _median_trees(problem, poses)
+    problem = replace(problem, sightings=_nearest(problem.sightings, most))
+    return problem, _values(problem, poses, trees, inert)
 
 
 def _nearest(s: Sightings, most: int) -> Sightings:
@@ -170,133 +194,6 @@ def _values(problem: Problem, poses: Array, trees: Array, inert: Inertia | None)
             values.insert(V + k, velocity[k])
             values.insert(B + k, bias)
     return values
-
-
-def orthonormal(poses: Array) -> Array:
-    """Poses (..., 4, 4) with rounding taken out of their rotations."""
-    U, _, Vt = np.linalg.svd(poses[..., :3, :3])
-    out = poses.copy()
-    out[..., :3, :3] = U @ Vt
-    return out
-
-
-def factors_of(
-    problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | None, *, without: Container[str] = ()
-) -> Iterator[tuple[str, Any]]:
-    """Every factor of the problem once, with its kind: "motion", "odometry", "imu", "fix", "link", "heading", "trunk", "tree".
-
-    Kinds in `without` are left out, and not built.
-    """
-    yield from ((kind, f) for kind, f in _motion(problem, inert) if kind not in without)
-    parts = (
-        ("fix", _fixes(problem, p)),
-        ("link", _links(problem)),
-        ("heading", _headings(problem, config)),
-        ("trunk", _trunks(problem, p)),
-        ("tree", _tree_priors(problem, p.height)),
-    )
-    for kind, part in parts:  # generators: what is left out has not begun
-        if kind not in without:
-            yield from ((kind, f) for f in part)
-
-
-def graph_of(
-    problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | None, *, without: Container[str] = ()
-) -> Any:
-    """A NonlinearFactorGraph of the factors whose kind is not in `without`."""
-    g = gtsam.NonlinearFactorGraph()
-    for _, f in factors_of(problem, p, config, inert, without=without):
-        g.add(f)
-    return g
-
-
-def _links(problem: Problem) -> Iterator[Any]:
-    if problem.link is not None:
-        sigma = [0.1, 0.1, 0.02, 0.2, 0.2, 0.5]
-        yield factors.odometry(X + problem.link.a, X + problem.link.b, orthonormal(problem.link.a_T_b), sigma)
-
-
-def _headings(problem: Problem, config: EstimateConfig) -> Iterator[Any]:
-    h = problem.headings
-    sigma = np.maximum(h.sigma, config.heading_floor)
-    yield from factors.headings((X + h.keyframe).tolist(), h.yaw, h.direction, sigma, Kernel("huber", 1.345))
-
-
-def _trunks(problem: Problem, p: Pass) -> Iterator[Any]:
-    s = problem.sightings
-    keys = (X + s.keyframe).tolist(), (L + problem.names()[s.tree]).tolist()
-    yield from factors.trunks(*keys, s.p, p.trunk_scale**2 * s.cov, p.trunk)
-
-
-def _tree_priors(problem: Problem, height: float) -> Iterator[Any]:
-    """Keep every tree in the system even when a loss has given up on all its sightings."""
-    wide = factors.sigmas([100.0, 100.0, height])
-    s, names = problem.sightings, problem.names()
-    if problem.known is not None:
-        k = problem.known
-        for i in np.flatnonzero(k.tree >= 0).tolist():
-            yield gtsam.PriorFactorPoint3(L + int(names[k.tree[i]]), k.p[i], factors.gaussian(k.cov[i]))
-    first = np.unique(s.tree, return_index=True)[1]
-    T = problem.start if problem.start is not None else problem.odom_T_robot
-    for i in first.tolist():
-        yield gtsam.PriorFactorPoint3(L + int(names[s.tree[i]]), transform(T[s.keyframe[i]], s.p[i]), wide)
-
-
-def _motion(problem: Problem, inert: Inertia | None) -> Iterator[tuple[str, Any]]:
-    n = len(problem.stamps_ns)
-    if problem.pose_sigma is not None:
-        assert problem.start is not None
-        for k in range(n):
-            exact = factors.sigmas([problem.pose_sigma] * 6)
-            yield "motion", gtsam.PriorFactorPose3(X + k, factors.to_pose3(problem.start[k]), exact)
-        return
-    step = inverse(problem.odom_T_robot[:-1]) @ problem.odom_T_robot[1:]
-    sigma = problem.step_sigma.copy()
-    if inert is not None:  # the gyro speaks through its own factor
-        covered = ~np.array([f is None for f in inert.preintegrated])
-        sigma[covered, :3] = np.maximum(5.0 * sigma[covered, :3], 0.05)
-    for f in factors.odometries([X + k for k in range(n)], orthonormal(step), sigma):
-        yield "odometry", f
-    georeferenced = len(problem.fixes.keyframe) >= 3
-    first = factors.to_pose3(orthonormal(problem.start[0] if problem.start is not None else problem.odom_T_robot[0]))
-    tilt = 0.3 if problem.up_sigma is not None and np.isfinite(problem.up_sigma).any() else 0.03
-    loose = [10.0, 10.0, 10.0, 1e4, 1e4, 1e4] if georeferenced else [tilt, tilt, 1e-3, 1e-3, 1e-3, 1e-3]
-    yield "motion", gtsam.PriorFactorPose3(X, first, factors.sigmas(loose))
-    if problem.inertial is None:
-        for k in range(0, n, 10):
-            yield "motion", factors.level(X + k, 0.3)
-        if problem.up is not None and problem.up_sigma is not None:
-            for k in np.flatnonzero(np.isfinite(problem.up_sigma)).tolist():
-                yield "motion", factors.level(X + k, float(problem.up_sigma[k]), problem.up[k])
-    elif inert is None:  # quick passes: the complementary filter's attitude stands in for the IMU factors
-        for k in range(0, n, 5):
-            yield "motion", factors.level(X + k, 0.02, problem.odom_T_robot[k, 2, :3])
-    if inert is not None:
-        for f in inert.factors(X, V, B):
-            yield "imu", f
-
-
-def _fixes(problem: Problem, p: Pass) -> Iterator[Any]:
-    """Each fix twice: its horizontal part and its height, each under a loss of its own.
-
-    Heights fail by tens of metres while positions are sound (a receiver that has just started): one must not take
-    the other with it.
-    """
-    f = problem.fixes
-    cov = _fix_cov(problem, p)
-    free = 1e6
-    flat, tall = cov.copy(), np.zeros_like(cov)
-    flat[:, 2, :2] = flat[:, :2, 2] = 0.0
-    flat[:, 2, 2] = free
-    tall[:, 0, 0] = tall[:, 1, 1] = free
-    tall[:, 2, 2] = cov[:, 2, 2]
-    for part in (flat, tall):
-        yield from factors.fixes((X + f.keyframe).tolist(), f.map_p_antenna, f.keyframe_p_antenna, part, p.fix)
-
-
-def _fix_cov(problem: Problem, p: Pass) -> Array:
-    f = problem.fixes
-    return np.asarray(p.fix_scale**2 * f.cov + p.fix_floor**2 * np.eye(3))
 
 
 def _median_trees(problem: Problem, poses: Array) -> Array:
@@ -391,67 +288,6 @@ def _polish(problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | 
     return values, linear
 
 
-def _tested(
-    problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | None, values: Any
-) -> tuple[Offset, ...]:
-    """Score tests (Rao 1948) of what is taken as given: clocks, mountings, the wheels' scale.
-
-    Each is a column of one more variable in the linear system of the solution, eliminated last. What it would have to be off
-    by, and how much better the residuals would be, follow without solving anew.
-    """
-    g = graph_of(problem, p, config, inert, without=("trunk", "fix", "odometry")).linearize(values)
-    path, trees = _path(problem, values), _trees(problem, values)
-    s, f = problem.sightings, problem.fixes
-    if problem.pose_sigma is None:
-        step = inverse(problem.odom_T_robot[:-1]) @ problem.odom_T_robot[1:]
-        for k, odometry in enumerate(f for kind, f in _motion(problem, inert) if kind == "odometry"):
-            A, b = odometry.linearize(values).jacobian()
-            longer = np.zeros((6, 1))
-            longer[3:, 0] = -step[k, :3, :3].T @ step[k, :3, 3] / problem.step_sigma[k, 3:]
-            g.add(gtsam.JacobianFactor(X + k, A[:, :6], X + k + 1, A[:, 6:], C, longer, b, _unit(6)))
-    if len(s):
-        mount = np.zeros((len(s), 3, 4))
-        mount[:, :, 0] = -s.late
-        mount[:, 0, 1] = mount[:, 1, 2] = -1.0
-        mount[:, 0, 3], mount[:, 1, 3] = s.p[:, 1], -s.p[:, 0]
-        factors.trunk_linear(
-            g, (X + s.keyframe).tolist(), (L + problem.names()[s.tree]).tolist(), path[s.keyframe], trees[s.tree], s.p,
-            p.trunk_scale**2 * s.cov, p.trunk, (C + 1, mount),
-        )  # fmt: skip
-    if len(f.keyframe):
-        R = path[f.keyframe, :3, :3]
-        moved = np.concatenate([(R @ f.late[:, :, None]), R[:, :, :2]], axis=2)
-        factors.fix_linear(
-            g, (X + f.keyframe).tolist(), path[f.keyframe], f.keyframe_p_antenna, f.map_p_antenna, _fix_cov(problem, p), p.fix,
-            (C + 2, moved),
-        )  # fmt: skip
-    parts = [("wheel scale", C, [0]), ("trunk clock", C + 1, [0]), ("trunk mount", C + 1, [1, 2]), ("trunk yaw", C + 1, [3]),
-             ("fix clock", C + 2, [0]), ("antenna", C + 2, [1, 2])]  # fmt: skip
-    size = {C: 1, C + 1: 4, C + 2: 3}
-    keys = g.keys()
-    present = [c for c in size if keys.count(c)]
-    if not present:
-        return ()
-    for c in present:  # what one fix cannot tell must not make the system singular
-        g.add(gtsam.JacobianFactor(c, 1e-3 * np.eye(size[c]), np.zeros(size[c]), _unit(size[c])))
-    H, eta = g.marginal(present).hessian(gtsam.Ordering(present))
-    at = dict(zip(present, np.cumsum([0] + [size[c] for c in present[:-1]]).tolist(), strict=True))
-    out = []
-    for name, key, rows in parts:
-        if key not in at:
-            continue
-        i = [at[key] + r for r in rows]
-        information = H[np.ix_(i, i)] + 1e-9 * np.eye(len(i))
-        value = np.linalg.solve(information, eta[i])
-        sigma = np.sqrt(np.diag(np.linalg.inv(information)))
-        out.append(Offset(name=name, value=value, sigma=sigma, gain=float(eta[i] @ value)))
-    return tuple(out)
-
-
-def _unit(n: int) -> Any:
-    return gtsam.noiseModel.Unit.Create(n)
-
-
 def _estimate(problem: Problem, config: EstimateConfig, values: Any, p: Pass, linear: Any, seconds: float) -> Estimate:
     poses, trees = _path(problem, values), _trees(problem, values)
     # What a known map's frame is off by is in its trees' covariances already.
@@ -490,7 +326,7 @@ def _other_residuals(problem: Problem, values: Any, p: Pass, config: EstimateCon
     misfit = log(inverse(step) @ inverse(poses[:-1]) @ poses[1:]) / problem.step_sigma
     out = {"odometry": misfit[:, 3:5].ravel(), "turn": misfit[:, 2]}
     if len(problem.fixes.keyframe):
-        variance = np.diagonal(_fix_cov(problem, p), axis1=1, axis2=2)
+        variance = np.diagonal(fix_cov(problem, p), axis1=1, axis2=2)
         out["fix"] = (_fix_residuals(problem, values) / np.sqrt(variance)).ravel()
     h = problem.headings
     if len(h.keyframe):

@@ -97,10 +97,10 @@ class Association:
     def solve(self, e: Estimate, *, least: int = 3, patient: bool = False, link: Link | None = None) -> Estimate:
         """An estimate without covariances of the trees as they are now; `patient`: until it has converged."""
         if link is not None:  # pull the loop shut with the trees as they were, then join them
-            e = graph.solve(replace(self.problem, start=e.map_T_robot, link=link), self.config.estimate, quick=True)
+            e = graph.quick(replace(self.problem, start=e.map_T_robot, link=link), self.config.estimate)
         tree, ids = self.trees(self.tree_of_track, least)
         self.problem = replace(self.of_trees(ids), sightings=self.seen.gather(tree), start=e.map_T_robot)
-        return graph.solve(self.problem, self.config.estimate, quick=True, patient=patient)
+        return graph.quick(self.problem, self.config.estimate, patient=patient)
 
     def named(self, tree: NDArray[np.int64]) -> NDArray[np.int64]:
         """The trees of the tracks, called by the first of their tracks, or by the known tree that they are: a name lasts from pass to
@@ -173,7 +173,7 @@ def associate_and_solve(
     problem: Problem, track: NDArray[np.int64], guess: Array | None, config: MappingConfig, progress: Progress
 ) -> tuple[Decided, Estimate, Loops]:
     d = problem.detections
-    estimate = graph.solve(problem, config.estimate, quick=True)
+    estimate = graph.quick(problem, config.estimate)
     if not len(d):
         problem = replace(problem, start=estimate.map_T_robot)
         none = np.zeros(0, np.int64)
@@ -204,9 +204,9 @@ def associate_and_solve(
     earlier: list[_Made] = []
     for n in range(LAST_ROUNDS if config.trees.reassociate else 1):
         decided = after
-        estimate = replace(graph.solve(decided.problem, config.estimate), tree=decided.tree)
+        converged = graph.converge(decided.problem, config.estimate)
         progress("solve", (n + 1) / LAST_ROUNDS)
-        after = a.decide(estimate)
+        after = a.decide(converged.estimate)
         made, former = _Made.of(after), _Made.of(decided)
         if made.like(former):
             turned = np.abs(after.shapes.slope - decided.shapes.slope).max(initial=0.0)
@@ -216,6 +216,8 @@ def associate_and_solve(
         elif any(made.like(m) for m in earlier):  # a track goes to and fro between two trees, and would for ever
             break
         earlier.append(former)
+    del after
+    estimate = replace(graph.finish(converged, config.estimate), tree=decided.tree)
     progress("solve", 1.0)
     return decided, estimate, a.closer.result
 

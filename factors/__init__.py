@@ -7,7 +7,7 @@ Poses are 4x4 matrices `map_T_robot`; tangent vectors and their covariances are 
 from factors.gnss import fix, fix_linear, fixes
 from factors.ground import level
 from factors.heading import heading, headings
-from factors.imu import ImuNoise, bias_walk, preintegrate, preintegrated
+from factors.imu import ImuNoise, bias_walk, preintegrate, preintegrated, preintegration
 from factors.noise import Kernel, gaussian, robust, sigmas
 from factors.odometry import odometries, odometry, odometry_2d
 from factors.pose import from_pose3, to_pose3, to_pose3s
@@ -33,6 +33,7 @@ __all__ = [
     "odometry_2d",
     "preintegrate",
     "preintegrated",
+    "preintegration",
     "range_2d",
     "robust",
     "sighting_2d",

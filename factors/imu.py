@@ -24,9 +24,20 @@ class ImuNoise:
     gravity: float = 9.80665
 
 
+def preintegration(noise: ImuNoise, robot_T_imu: NDArray[np.float64]) -> Any:
+    """Parameters for `preintegrate`: once for all intervals of a run, each of which refers to them."""
+    p = gtsam.PreintegrationCombinedParams.MakeSharedU(noise.gravity)
+    p.setGyroscopeCovariance(np.eye(3) * noise.gyro**2)
+    p.setAccelerometerCovariance(np.eye(3) * noise.accel**2)
+    p.setIntegrationCovariance(np.eye(3) * 1e-8)
+    p.setBiasOmegaCovariance(np.eye(3) * noise.gyro_walk**2)
+    p.setBiasAccCovariance(np.eye(3) * noise.accel_walk**2)
+    p.setBodyPSensor(to_pose3(robot_T_imu))
+    return p
+
+
 def preintegrate(
-    noise: ImuNoise,
-    robot_T_imu: NDArray[np.float64],
+    parameters: Any,
     seconds: NDArray[np.float64],
     gyro: NDArray[np.float64],
     accel: NDArray[np.float64],
@@ -35,14 +46,7 @@ def preintegrate(
     """Preintegrated samples: each of (N, 3) rates holds for its interval of `seconds` (N,), all positive."""
     if not ((seconds > 0).all() and np.isfinite(gyro).all() and np.isfinite(accel).all()):
         raise ValueError("inertial samples must be finite and their intervals positive")
-    p = gtsam.PreintegrationCombinedParams.MakeSharedU(noise.gravity)
-    p.setGyroscopeCovariance(np.eye(3) * noise.gyro**2)
-    p.setAccelerometerCovariance(np.eye(3) * noise.accel**2)
-    p.setIntegrationCovariance(np.eye(3) * 1e-8)
-    p.setBiasOmegaCovariance(np.eye(3) * noise.gyro_walk**2)
-    p.setBiasAccCovariance(np.eye(3) * noise.accel_walk**2)
-    p.setBodyPSensor(to_pose3(robot_T_imu))
-    pim = gtsam.PreintegratedCombinedMeasurements(p, gtsam.imuBias.ConstantBias(np.zeros(3), gyro_bias))
+    pim = gtsam.PreintegratedCombinedMeasurements(parameters, gtsam.imuBias.ConstantBias(np.zeros(3), gyro_bias))
     for a, w, dt in zip(accel, gyro, seconds.tolist(), strict=True):
         pim.integrateMeasurement(a, w, dt)
     return pim

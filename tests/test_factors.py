@@ -137,7 +137,9 @@ def test_preintegration_is_as_sure_as_its_samples() -> None:
     noise = factors.ImuNoise(gyro=2e-3, accel=3e-2)
     n, dt = 400, 0.005
     accel = np.tile([0.0, 0.0, 9.80665], (n, 1))
-    pim = factors.preintegrate(noise, np.eye(4), np.full(n, dt), np.zeros((n, 3)), accel, np.zeros(3))
+    pim = factors.preintegrate(
+        factors.preintegration(noise, np.eye(4)), np.full(n, dt), np.zeros((n, 3)), accel, np.zeros(3)
+    )
     sigma = np.sqrt(np.diag(pim.preintMeasCov()))
     np.testing.assert_allclose(sigma[:3], 2e-3 * np.sqrt(n * dt), rtol=0.02)
     assert sigma[8] == pytest.approx(3e-2 * np.sqrt(n * dt), rel=0.1)

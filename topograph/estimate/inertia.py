@@ -50,6 +50,7 @@ def inertia(problem: Problem) -> Inertia | None:
     noise = factors.ImuNoise(gyro=2.0 * imu.gyro_density, accel=2.0 * imu.accel_density)
     mount = np.eye(4)
     mount[:3, 3] = imu.robot_T_imu[:3, 3]  # the samples are in the base's axes already
+    parameters = factors.preintegration(noise, mount)
     stamps = imu.stamps_ns
     out: list[Any] = []
     for a, b in zip(problem.stamps_ns[:-1].tolist(), problem.stamps_ns[1:].tolist(), strict=True):
@@ -64,5 +65,5 @@ def inertia(problem: Problem) -> Inertia | None:
         t, middle = (stamps[low:high] - a) * 1e-9, (0.5 * (edges[:-1] + edges[1:]) - a) * 1e-9
         gyro = np.stack([np.interp(middle, t, imu.gyro[low:high, k]) for k in range(3)], axis=1)
         accel = np.stack([np.interp(middle, t, imu.accel[low:high, k]) for k in range(3)], axis=1)
-        out.append(factors.preintegrate(noise, mount, dt, gyro, accel, imu.gyro_bias))
+        out.append(factors.preintegrate(parameters, dt, gyro, accel, imu.gyro_bias))
     return Inertia(out, np.diff(problem.stamps_ns) * 1e-9, noise, imu.gyro_bias)

@@ -373,9 +373,13 @@ SEEN_ANEW = 12.0
 
 
 def twice(xy: Array) -> float:
-    """Share of trees (T, 2) that have another one nearer than a quarter of the usual distance; 0 where they are fewer than PAIRS pairs."""
+    """Share of trees (T, 2) that have another one nearer than a quarter of the usual distance; 0 where they are fewer than PAIRS pairs.
+
+    Where most are there twice, their second one is the usual distance: the third nearest is another tree's.
+    """
     if len(xy) < 6:
         return 0.0
-    distance = np.asarray(cKDTree(xy).query(xy, k=2)[0])[:, 1]
-    near = distance < 0.25 * np.median(distance)
+    distance = np.asarray(cKDTree(xy).query(xy, k=4)[0])
+    usual = np.median(distance, axis=0)
+    near = distance[:, 1] < max(0.25 * usual[1], 0.15 * usual[3])
     return float(near.mean()) if near.sum() >= 2 * PAIRS else 0.0

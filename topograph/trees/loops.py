@@ -199,7 +199,7 @@ def _piece(t: TrackTable, tree: NDArray[np.int64], chosen: NDArray[np.bool_], si
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recognised:
     """Old ground: `pairs` (i, j) of recent and old trees that are one, the `move` (x, y, yaw) of the recent ones about their `centre` (2,), and how far it moves
-    one of them at most (`moved`, m); `slid` that in spacings where the planting is regular, else 0."""
+    one of them at most (`moved`, m); `slid` its shift in spacings where the planting is regular, else 0: what turns by as much fits another row no better."""
 
     pairs: list[tuple[int, int]]
     move: Array
@@ -222,6 +222,9 @@ SAFE = 0.25
 """Of the spacing: what dead reckoning knows to this is the same tree, however regular the planting."""
 ENOUGH = 9
 """Trees from which the planting's irregularity is measured."""
+STRAYED = 30.0
+"""Squared Mahalanobis distance from where dead reckoning and GNSS have it (3 dof; by chance once in a million): however well a lattice fits there, it is
+another place. A vineyard driven with RTK was laid onto itself three vines further on."""
 REGULAR = 1.0
 """Squares of the jitter, in variances of where trees are, below which a lattice looks the same from every row: a row beside costs twice that per tree, in nats."""
 SCATTERED = 5
@@ -274,11 +277,8 @@ def recognise(
     away = placed.pose - [*centre, 0.0]
     away[:, 2] = (away[:, 2] + np.pi) % (2 * np.pi) - np.pi
     total = off + _in_map(np.asarray(np.linalg.inv(placed.information)), placed.pose[:, 2])
-    log = (
-        placed.log
-        - 0.5 * np.einsum("mi,mij,mj->m", away, np.linalg.inv(total), away)
-        - 0.5 * np.linalg.slogdet(2 * np.pi * total)[1]
-    )
+    strayed = np.einsum("mi,mij,mj->m", away, np.linalg.inv(total), away)
+    log = placed.log - 0.5 * strayed - 0.5 * np.linalg.slogdet(2 * np.pi * total)[1]
     among = log - alike * (placed.tree >= 0).sum(axis=1)
     best = int(np.argmax(among))
     corners = np.array([[0, 0], [arm, 0], [0, arm]])
@@ -291,13 +291,13 @@ def recognise(
         beside = int((apart[near] < AROUND).sum())
         beyond = float(marks.other.sum()) + beside * np.log(1.0 - SHOWN)
     surer = float(among[best] - np.logaddexp.reduce([*rivals, rest, beyond]))
-    if log[best] - new_ground < margin or surer < RIVAL * margin:
+    if log[best] - new_ground < margin or surer < RIVAL * margin or strayed[best] > STRAYED:
         return None
     move = off @ np.linalg.solve(total[best], away[best])  # as far as the drift allows
     moved = float(np.abs(_moved(move, here - centre) - (here - centre)).max())
     rows = np.flatnonzero(placed.tree[best] >= 0)
     pairs = [(int(i), int(near[placed.tree[best, i]])) for i in rows]
-    slid = moved / gap if jitter**2 < REGULAR * variance else 0.0
+    slid = float(np.hypot(*move[:2])) / gap if jitter**2 < REGULAR * variance else 0.0
     return Recognised(pairs=pairs, move=move, centre=centre, moved=moved, slid=slid)
 
 

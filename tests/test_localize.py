@@ -15,16 +15,16 @@ from topograph.bags import Imu, Odometry, Trunks
 from topograph.cli import main
 from topograph.errors import InsufficientDataError
 from topograph.evaluate import Truth, read_tum
-from topograph.geometry import Array, interpolate
+from topograph.geometry import Array, interpolate, planar
 from topograph.localize import LocalizeConfig, Localizer, ThesisConfig, ThesisMethod
-from topograph.localize.engine import Engine
+from topograph.localize.engine import Engine, on_top
 from topograph.localize.filter import Filter
 from topograph.localize.posterior import describe, weigh
 from topograph.localize.submap import Move, Submap, Sweep, Visibility
 from topograph.localize.thesis import multilaterate
 from topograph.motion import Leg, Reckoner
 from topograph.places.index import MapIndex, build_index
-from topograph.places.search import search
+from topograph.places.search import Landmarks, search
 from topograph.simulate import DESIGNS, DriveConfig, SensorConfig, record
 from topograph.simulate.starts import SCENARIOS, StartsConfig, drive, world
 from topograph.topomap import TopoMap
@@ -49,6 +49,38 @@ def told(c: StartsConfig) -> LocalizeConfig:
 
 def index_of(xy: Array, config: LocalizeConfig) -> MapIndex:
     return build_index(xy, np.zeros(len(xy)), np.full(len(xy), np.nan), config.view, config.pair, config.map_sigma)
+
+
+# -- the search ---------------------------------------------------------------------------------------------------
+
+
+@given(seeds, st.floats(0.8, 2.5), st.floats(2.5, 6.0))
+@settings(max_examples=40, deadline=None)
+def test_a_search_finds_the_place_where_trees_are_dense(seed: int, tree: float, row: float) -> None:
+    """Apples a metre apart: pairs of trees are listed up to six metres, and no longer pair of landmarks may be looked up among them."""
+    rng = np.random.default_rng(seed)
+    xy = np.stack(np.meshgrid(np.arange(30) * tree, np.arange(5) * row), axis=2).reshape(-1, 2)
+    xy = xy + 0.03 * rng.normal(size=xy.shape)
+    config = LocalizeConfig()
+    index = index_of(xy, config)
+    x, y, yaw = rng.uniform([3 * tree, 0, -3], [26 * tree, 4 * row, 3])
+    near = xy[np.argsort(np.hypot(*(xy - [x, y]).T))[:40]] - [x, y]
+    c, s = np.cos(yaw), np.sin(yaw)
+    m = near @ np.array([[c, -s], [s, c]]) + 0.01 * rng.normal(size=near.shape)
+    n = len(m)
+    marks = Landmarks(
+        m=m, cov=1e-4 * np.eye(2 * n), var=np.full(n, 1e-4), diameter=np.full(n, np.nan), diameter_var=np.full(n, np.nan),
+        tree=np.full(n, np.log(0.9)), other=np.full(n, np.log(0.1 * index.density)), lasting=np.full(n, 0.9),
+    )  # fmt: skip
+    found = search(marks, index, config.places)
+    off = np.hypot(*(found.pose[:, :2] - [x, y]).T) + np.abs((found.pose[:, 2] - yaw + np.pi) % (2 * np.pi) - np.pi)
+    assert off.min() < 0.2
+
+
+def test_on_top_of_each_other() -> None:
+    """A frame in which the robot stands where it is, laid so that it does."""
+    at = on_top(np.array([3.0, 4.0, 0.7]), np.array([1.0, -2.0, 0.2]))
+    np.testing.assert_allclose(planar(*at) @ planar(1.0, -2.0, 0.2), planar(3.0, 4.0, 0.7), atol=1e-12)
 
 
 # -- the filter ---------------------------------------------------------------------------------------------------

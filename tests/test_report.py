@@ -1,5 +1,6 @@
 """Pages: what became of a run stands first, nothing that a recording says is taken for markup, pictures show what they claim."""
 
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -80,6 +81,11 @@ def seen(state: str, along: float = 0.02) -> Report:
         ([seen("tracking")] * 6 + [seen("degraded", 5.0)] * 4, "fair", ["40 %", "degraded", "5.0 m"]),
         ([seen("tracking")] * 9 + [seen("lost")], "fair", ["lost at the end", "90.0 %"]),
         ([seen("searching")] * 10, "bad", ["unknown"]),
+        (
+            [replace(seen("searching"), why="so regular", hypotheses=3)] * 10,
+            "bad",
+            ["unknown: so regular", "3 are left"],
+        ),
     ],
 )
 def test_a_localization_says_what_came_after_it_was_found(reports: list[Report], tone_of: str, says: list[str]) -> None:

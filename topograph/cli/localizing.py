@@ -203,9 +203,8 @@ def verdict(reports: Sequence[Any], distance: Sequence[float]) -> str:
         ]
         return "; ".join(parts)
     last = reports[-1]
-    if last.hypotheses > 1:
-        return f"unknown: {last.hypotheses} places fit, up to {last.apart:.0f} m apart"
-    return "unknown: nothing on this map fits what was seen well enough"
+    left = f" ({last.hypotheses} are left, up to {last.apart:.0f} m apart)" if last.hypotheses > 1 else ""
+    return f"unknown: {last.why or 'no place was found'}{left}"
 
 
 WIDE_M = 0.5

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,12 @@ DRAGGED_AGAIN = 5.0
 CROWD, FEW = 3.0, 0.3
 """Where more trees than this should be seen, and fewer than this share of them are, the pose is in doubt at once."""
 NO_PAIRS = np.zeros((0, 2), np.int64)
+LITTLE, SEVERAL, ALIKE, ELSEWHERE = REASONS = (
+    "too few trees were seen to tell places apart",
+    "several places of the map fit",
+    "the planting is so regular that another one of its design would fit as well (if that cannot be, set localize.alike to 1e-9)",
+    "nothing on this map fits what was seen well enough",
+)
 STATES = ("searching", "ambiguous", "tracking", "degraded", "lost")
 
 
@@ -46,6 +52,7 @@ class Belief:
         risk: chance that the pose (or the best place) is wrong.
         places: (H, 3) the robot's poses of those hypotheses, most probable first, and `weights` (H,).
         pairs: (K, 2) rows of the sweep's trunks and of the mapped trees that they are.
+        why: while nothing is committed, what stands against it: one of `REASONS`; else "".
     """
 
     state: str
@@ -56,6 +63,7 @@ class Belief:
     places: Array
     weights: Array
     pairs: NDArray[np.int64]
+    why: str = ""
 
     @property
     def committed(self) -> bool:
@@ -175,6 +183,9 @@ class Engine:
         found = next(h.search)
         if found is None:
             return False
+        if self.track is not None:  # whatever a search left out, the place that is held is a rival
+            own = on_top(self.track.mean[:3], h.submap.filter.mean[:3])
+            found = replace(found, pose=np.concatenate([found.pose, own[None]]), loss=np.append(found.loss, np.inf))
         h.search, h.found, h.informed = None, found, True
         marks, rows = describe(h.submap, self.index, c)
         h.posterior, h.rows = weigh(found, marks, h.submap, self.index, c), rows
@@ -415,7 +426,25 @@ class Engine:
             places=places,
             weights=p.p[: len(places)],
             pairs=pairs,
+            why=self._why(n),
         )
+
+    def _why(self, places: int) -> str:
+        """What stands against a commit, with so many `places` left."""
+        p = self.hunt.posterior
+        if not len(p.p):
+            return ELSEWHERE if self.hunt.informed else LITTLE
+        if p.unknown > self.config.risk and p.alike > 0.5 * p.unknown and p.unknown > 0.5 * p.risk:
+            return ALIKE
+        return SEVERAL if places > 1 or p.unknown < 0.5 * p.risk else ELSEWHERE
+
+
+def on_top(map_pose: Array, frame_pose: Array) -> Array:
+    """Pose (3,) x, y, yaw in the map of a frame in which the robot is at `frame_pose` (3,), when it is at `map_pose` (3,)."""
+    yaw = map_pose[2] - frame_pose[2]
+    c, s = np.cos(yaw), np.sin(yaw)
+    x, y = frame_pose[:2]
+    return np.array([map_pose[0] - c * x + s * y, map_pose[1] - s * x - c * y, yaw])
 
 
 def anchored(hunt: _Hunt, index: MapIndex, config: LocalizeConfig) -> Filter:

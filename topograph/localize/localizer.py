@@ -217,6 +217,7 @@ class GraphMethod:
             along=float(np.sqrt(along)),
             across=float(np.sqrt(across)),
             weights=belief.weights,
+            why=belief.why,
         )
 
     def _upright(self, leg: Leg, trunks: Trunks) -> Leg:

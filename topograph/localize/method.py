@@ -42,6 +42,7 @@ class Report:
         weights: (H,) their probabilities, or empty where the method has none.
         trees: ids of the mapped trees seen.
         pairs: (K, 2) rows of the scan's trunks and of the map's trees.
+        why: while there is no pose, what stands against one, in words; else "".
         along, across: standard deviations of the position along and across the rows (east and north without rows), m.
     """
 
@@ -56,6 +57,7 @@ class Report:
     along: float
     across: float
     weights: Array = field(default_factory=lambda: np.zeros(0))
+    why: str = ""
 
     @property
     def apart(self) -> float:

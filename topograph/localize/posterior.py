@@ -25,7 +25,7 @@ class Posterior:
 
     Attributes:
         pose: (M, 3) x, y, yaw of the submap's frame in the map, falling probability.
-        p: (M,) probabilities; `unknown`: not on this map; `rest`: placements that were dropped or not evaluated.
+        p: (M,) probabilities; `unknown`: not on this map, of which `alike`: in another orchard of its design; `rest`: placements that were dropped or not evaluated.
         tree: (M, n) mapped tree of each landmark, -1 none.
         scale: (M,) most probable noise scale.
         log: (M,) log evidence, to compare with the same submap later.
@@ -34,6 +34,7 @@ class Posterior:
     pose: Array
     p: Array
     unknown: float
+    alike: float
     rest: float
     tree: NDArray[np.int64]
     scale: Array
@@ -51,6 +52,7 @@ def nothing() -> Posterior:
         pose=np.zeros((0, 3)),
         p=np.zeros(0),
         unknown=1.0,
+        alike=0.0,
         rest=0.0,
         tree=np.zeros((0, 0), np.int64),
         scale=np.zeros(0),
@@ -113,7 +115,8 @@ def weigh(found: Found, marks: Landmarks, submap: Submap, index: MapIndex, confi
     design = placed.alike - np.log(np.pi / (2.0 * index.density))
     # Looking again and again finds a lucky fit sooner or later: the longer nothing was sure, the more is asked.
     alike_prior = c.alike * max(1.0, submap.filter.run / LOOKS_EVERY)
-    unknown = np.logaddexp(np.log(c.unknown) + random, np.log(alike_prior) + design)
+    design += np.log(alike_prior)
+    unknown = np.logaddexp(np.log(c.unknown) + random, design)
     rest = (np.log(found.rest) + log.min()) if found.rest > 0 else -np.inf
     dropped = np.log(max(found.seeds, 1)) - c.bound + log.max()
     rest = np.logaddexp(rest, dropped)
@@ -122,6 +125,7 @@ def weigh(found: Found, marks: Landmarks, submap: Submap, index: MapIndex, confi
         pose=placed.pose,
         p=np.exp(log - total),
         unknown=float(np.exp(unknown - total)),
+        alike=float(np.exp(design - total)),
         rest=float(np.exp(rest - total)),
         tree=placed.tree,
         scale=placed.scale,

@@ -24,7 +24,7 @@ class MapIndex:
         origin, cell: of the raster `nearest` (X, Y): the tree nearest to each cell's centre, -1: none near.
         bucket, start, member: coarse cells of `bucket` m (see `buckets`) and their trees (CSR); `place` (T,) the cell of a tree.
         buckets: (2,) number of coarse cells along x and y.
-        length: (P,) rising; `a`, `b` (P,) the pairs of trees so far apart.
+        length: (P,) rising; `a`, `b` (P,) the pairs of trees so far apart; `reach`, m, up to which all pairs are among them.
         density: trees per m² where there are trees.
         area: m² in which the robot may be.
         jitter: irregularity of the planting per axis, m, without the map's own error.
@@ -47,6 +47,7 @@ class MapIndex:
     length: NDArray[np.float32]
     a: NDArray[np.int32]
     b: NDArray[np.int32]
+    reach: float
     density: float
     area: float
     jitter: float
@@ -140,6 +141,7 @@ def build_index(
         length=length[by_length].astype(np.float32),
         a=pairs[by_length, 0].astype(np.int32),
         b=pairs[by_length, 1].astype(np.int32),
+        reach=reach if reach < np.hypot(*np.ptp(xy, axis=0)) else np.inf,
         density=density,
         area=area,
         jitter=jitter,

@@ -152,13 +152,14 @@ def _anchors(marks: Landmarks, index: MapIndex, config: PlacesConfig) -> list[tu
     slack = 3.6 * 1.4 * np.sqrt(np.maximum(var, 1e-8))
     low = np.searchsorted(index.length, (length - slack).astype(np.float32))
     high = np.searchsorted(index.length, (length + slack).astype(np.float32))
-    usable = (length > 1.0) & (high > low) & (length + slack < float(index.length[-1]) + 0.5)
+    # In a lattice all pairs of one length may lie just beyond what is listed: what cannot be found must not be looked for.
+    usable = (length > 1.0) & (high > low) & (length + slack < index.reach)
     # A landmark whose distances to the others the map hardly knows is likely none of its trees.
     known = np.zeros(n)
     total = np.zeros(n)
     np.add.at(known, a, usable)
     np.add.at(known, b, usable)
-    within = length < float(index.length[-1])
+    within = length < index.reach
     np.add.at(total, a, within)
     np.add.at(total, b, within)
     q = marks.lasting * np.clip((known + 1) / (total + 1), 0.05, 1.0)

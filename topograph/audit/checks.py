@@ -167,7 +167,9 @@ def jumps(problem: Problem, estimate: Estimate, streams: Streams, lever: Array) 
             continue  # scattered outliers, not two places
         if outvoted and _left_behind(off, refused, i, step):
             continue  # a few are elsewhere for a while, and the solve has not followed them
-        bound = max(JUMP[0], JUMP[1] * float(np.median(sigma[mine])))
+        # A receiver that says that it floats from here on has told of the step.
+        stated = max(float(np.median(part)) for part in (sigma[mine][:JUMP_FIXES], sigma[mine][JUMP_FIXES:]))
+        bound = max(JUMP[0], JUMP[1] * stated)
         if step > bound and step / bound > worst / most:
             worst, when, most = step, (fix_ns[i] - motion.stamps_ns[0]) * 1e-9, bound
     if worst > 0:

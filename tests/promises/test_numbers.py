@@ -121,7 +121,7 @@ def test_axes_are_as_the_last_path_has_them(degraded: list[Mapped]) -> None:
         s = m.solved
         d = s.detections
         own = shapes(d, s.tree, map_T_scans(s), len(s.estimate.trees))
-        np.testing.assert_allclose(s.shapes.slope, own.slope, atol=1e-3)
+        np.testing.assert_allclose(s.shapes.slope, own.slope, atol=1e-9)
 
 
 def test_clean_runs_are_called_sound_and_leave_nothing_out(rtk: list[Mapped]) -> None:

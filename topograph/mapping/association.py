@@ -24,6 +24,7 @@ from topograph.trees import (
     deviation,
     drift,
     exists,
+    feet,
     gather,
     moved_pose,
     refine,
@@ -62,10 +63,12 @@ class Association:
         """map_T_scan (S, 4, 4)."""
         return path_at(e.stamps_ns, e.map_T_robot, self.problem.motion, self.problem.detections.stamps_ns)
 
-    def table(self, e: Estimate) -> TrackTable:
-        """Tracks in the map as estimated; trees of an earlier map are tracks seen long ago."""
-        d = self.problem.detections
-        t = tabulate(d, self.track, self.poses(e), self.problem.motion.distance_at(d.stamps_ns))
+    def table(self, e: Estimate, *, settled: bool = False) -> TrackTable:
+        """Tracks in the map as estimated, with their feet along their own axes where the path has `settled`; trees of an earlier map are tracks seen
+        long ago."""
+        d, map_T_scan = self.problem.detections, self.poses(e)
+        foot = feet(d, self.track, map_T_scan) if settled else None
+        t = tabulate(d, self.track, map_T_scan, self.problem.motion.distance_at(d.stamps_ns), foot)
         k = self.problem.known
         if k is None:
             return t
@@ -117,7 +120,7 @@ class Association:
     def decide(self, e: Estimate) -> Decided:
         """What there is, given an estimate."""
         c, d = self.config.trees, self.problem.detections
-        t = self.table(e)
+        t = self.table(e, settled=True)
         self.tree_of_track = self.named(refine(t, self.tree_of_track, c))
         map_T_scan = self.poses(e)
         tree, ids = self.trees(self.tree_of_track, 1)
@@ -131,13 +134,17 @@ class Association:
             keep[self.tree_of_track[self.tracks :]] = True
         tree, final = self.trees(self.tree_of_track, 1, keep)
         problem = self.of_trees(final)
-        # A known map states its trees at one height, whatever their stems.
-        whole = None if problem.known is None else problem.known.tree[problem.known.tree >= 0]
-        shape = shapes(d, tree, map_T_scan, len(final), whole)
+        shape = self.shapes(problem, tree, map_T_scan)
         own = relevelled(d, tree, map_T_scan, shape)
         sightings = gather(own, tree, problem.stamps_ns, problem.motion)
         problem = replace(problem, start=e.map_T_robot, detections=own, sightings=sightings)
         return Decided(tree, problem, found.select(np.searchsorted(ids, final)), shape, int((~found.ok).sum()))
+
+    def shapes(self, problem: Problem, tree: NDArray[np.int64], map_T_scan: Array) -> Shapes:
+        """Of the trees of a problem, seen from map_T_scan (S, 4, 4)."""
+        # A known map states its trees at one height, whatever their stems.
+        whole = None if problem.known is None else problem.known.tree[problem.known.tree >= 0]
+        return shapes(self.problem.detections, tree, map_T_scan, problem.n_trees, whole)
 
     def trees(
         self, tree_of_track: NDArray[np.int64], least: int, keep: NDArray[np.bool_] | None = None
@@ -195,7 +202,7 @@ def associate_and_solve(
     for n, patience in enumerate((4.0, 2.0, 1.0) if config.trees.reassociate else ()):
         progress("refine", n / 3)
         before = a.tree_of_track
-        a.tree_of_track = a.named(refine(a.table(estimate), before, config.trees, patience))
+        a.tree_of_track = a.named(refine(a.table(estimate, settled=True), before, config.trees, patience))
         if not np.array_equal(a.tree_of_track, before):
             estimate = a.solve(estimate, patient=True)
     progress("solve", 0.0)
@@ -209,17 +216,16 @@ def associate_and_solve(
         after = a.decide(converged.estimate)
         made, former = _Made.of(after), _Made.of(decided)
         if made.like(former):
-            turned = np.abs(after.shapes.slope - decided.shapes.slope).max(initial=0.0)
-            decided = replace(decided, shapes=after.shapes)  # as the last path has them
-            if turned < SETTLED:
+            if np.abs(after.shapes.slope - decided.shapes.slope).max(initial=0.0) < SETTLED:
                 break
         elif any(made.like(m) for m in earlier):  # a track goes to and fro between two trees, and would for ever
             break
         earlier.append(former)
     del after
     estimate = replace(graph.finish(converged, config.estimate), tree=decided.tree)
+    as_seen = a.shapes(decided.problem, decided.tree, a.poses(estimate))  # from the last path
     progress("solve", 1.0)
-    return decided, estimate, a.closer.result
+    return replace(decided, shapes=as_seen), estimate, a.closer.result
 
 
 FLIPS = 1e-4

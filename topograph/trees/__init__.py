@@ -8,7 +8,7 @@ from topograph.trees.keyframes import choose_keyframes
 from topograph.trees.loops import Closed, LoopCloser, Loops, TrackTable, moved_pose, tabulate
 from topograph.trees.refine import refine
 from topograph.trees.screen import screen
-from topograph.trees.shape import Shapes, relevelled, shapes
+from topograph.trees.shape import Shapes, feet, relevelled, shapes
 from topograph.trees.sightings import AtKeyframes, Sightings, gather
 from topograph.trees.slip import SlipWatch
 from topograph.trees.tracks import Tracker, TreesConfig, follow
@@ -35,6 +35,7 @@ __all__ = [
     "deviation",
     "drift",
     "exists",
+    "feet",
     "follow",
     "gather",
     "grounds",

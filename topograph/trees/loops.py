@@ -322,13 +322,18 @@ def _looked_at(m: Array) -> tuple[Array, Array]:
     return np.where(np.asarray(away).reshape(x.shape) < AROUND, looks, 0.0), low
 
 
-def tabulate(detections: Detections, track: NDArray[np.int64], map_T_scan: Array, distance: Array) -> TrackTable:
-    """Table of tracks 0..T-1 from their detections, seen from map_T_scan (S, 4, 4) after `distance` (S,) driven, m."""
+def tabulate(
+    detections: Detections, track: NDArray[np.int64], map_T_scan: Array, distance: Array, foot: Array | None = None
+) -> TrackTable:
+    """Table of tracks 0..T-1 from their detections, seen from map_T_scan (S, 4, 4) after `distance` (S,) driven, m. `foot` (N, 2) in the map where
+    something better is known than each scan's own axis tells.
+    """
     d, n = detections, int(track.max(initial=-1)) + 1
     T, driven = map_T_scan[d.scan], distance[d.scan]
     xy = transform(T, d.p)[:, :2]
-    above = np.where(np.isfinite(d.height), d.height, 0.0) / np.maximum(d.axis[:, 2], 0.3)
-    foot = transform(T, d.p - above[:, None] * d.axis)[:, :2]
+    if foot is None:
+        above = np.where(np.isfinite(d.height), d.height, 0.0) / np.maximum(d.axis[:, 2], 0.3)
+        foot = transform(T, d.p - above[:, None] * d.axis)[:, :2]
     hits = np.bincount(track, minlength=n)
     total = np.maximum(hits, 1)
 

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from topograph.geometry import Array
 from topograph.trees.loops import TrackTable
 from topograph.trees.robust import weighted_median
 from topograph.trees.tracks import TreesConfig
@@ -26,7 +25,7 @@ def refine(
     than `config.merge` (a thick trunk's pieces: than its radius), become one, but for a post beside a tree. Rare tracks join a tree when they fit and are trees of their own otherwise.
     """
     place, sigma, hits = tracks.place, tracks.sigma, tracks.hits
-    tree = _leave(place, sigma, hits, tree.copy(), config, max(patience, config.merge))
+    tree = _leave(tracks, tree.copy(), config, max(patience, config.merge))
     for _ in range(4):
         ids, index = np.unique(tree, return_inverse=True)
         w = hits / np.maximum(sigma, config.floor) ** 2
@@ -58,23 +57,18 @@ def refine(
     return np.asarray(np.unique(tree, return_inverse=True)[1])
 
 
-def _leave(
-    place: Array,
-    sigma: Array,
-    hits: NDArray[np.int64],
-    tree: NDArray[np.int64],
-    config: TreesConfig,
-    patience: float,
-) -> NDArray[np.int64]:
+def _leave(tracks: TrackTable, tree: NDArray[np.int64], config: TreesConfig, patience: float) -> NDArray[np.int64]:
     fresh = int(tree.max(initial=0)) + 1
     order = np.argsort(tree, kind="stable")
     for group in np.split(order, np.flatnonzero(np.diff(tree[order])) + 1):
         if len(group) < 2:
             continue
         # Weighted median: a wrong track must not drag the tree towards itself.
-        centre = np.array([weighted_median(place[group, k], hits[group]) for k in range(2)])
-        d = np.linalg.norm(place[group] - centre, axis=1)
-        bound = np.sqrt(config.gate * (sigma[group] ** 2 + 2 * config.floor**2))
+        d = np.full(len(group), np.inf)
+        for at in (tracks.place[group], tracks.foot[group]):  # stems of one tree are near each other at one of them
+            centre = np.array([weighted_median(at[:, k], tracks.hits[group]) for k in range(2)])
+            d = np.minimum(d, np.linalg.norm(at - centre, axis=1))
+        bound = np.sqrt(config.gate * (tracks.sigma[group] ** 2 + 2 * config.floor**2))
         for g in group[d > np.maximum(bound, patience)]:
             tree[g] = fresh
             fresh += 1

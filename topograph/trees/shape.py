@@ -256,6 +256,20 @@ def _slopes(d: Detections, map_T_scan: Array) -> tuple[Array, Array]:
     return turned[:, :2] / flat[:, None], np.where(np.abs(turned[:, :2]).max(axis=1) < flat, weight, 0.0)
 
 
+def feet(detections: Detections, track: NDArray[np.int64], map_T_scan: Array) -> Array:
+    """Where each sighting (N, 2) has the foot of its column in the map, along the axis that all of its `track` (N,) measured: one scan's
+    axis is mostly what it took for granted, and stems that part from one foot would seem to stand apart.
+    """
+    d, n = detections, int(track.max(initial=-1)) + 1
+    slope, weight = _slopes(d, map_T_scan)
+    weight = ALIKE * np.minimum(weight, 1.0 / 0.03**2)
+    total = np.bincount(track, weight, n) + 1.0 / LEAN_PRIOR**2
+    lean = np.stack([np.bincount(track, weight * slope[:, k], n) / total for k in range(2)], axis=1)
+    _, middle, lever = _places(d, map_T_scan)
+    above = np.where(np.isfinite(d.height), d.height - lever, 0.0)
+    return np.asarray(middle - above[:, None] * lean[track])
+
+
 def _together(slope: Array, weight: Array) -> tuple[Array, Array]:
     """Mean slope (2,) with the prior, robust to sightings of something else, and the weight (M,) that each was given."""
     prior = 1.0 / LEAN_PRIOR**2

@@ -344,7 +344,7 @@ class Engine:
                 # Too far from the tree to be it, too near to be another: as in a lattice that is off by its jitter.
                 k = int(np.argmin(m2[i]))
                 ratio = 1.0 + 2 * index.jitter**2 / np.exp(0.5 * logdet[i, k])
-                slip += 2.5 * min(ratio / 9.0, 1.0) if f.tree[k] >= 0 else 0.0
+                slip += 2.5 * min(ratio / 9.0, 1.0) * min(ratio - 1.0, 1.0) if f.tree[k] >= 0 else 0.0
             else:
                 at = f.mean[:2] + [c_ * z[i, 0] - s_ * z[i, 1], s_ * z[i, 0] + c_ * z[i, 1]]
                 if len(self.near(at, 1.3 / np.sqrt(index.density))):  # trees beyond the map's edge say nothing

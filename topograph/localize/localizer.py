@@ -127,6 +127,11 @@ GROUND_SIGMA = 0.08
 """What the grounds that a sweep sees under its trees are off by in common (grass, slope within a cell), m."""
 
 
+SHARED = 0.2
+"""Of the deviations of mapped trees, what neighbours have in common, having been mapped from the same stretch of path: thirty of them in view do not
+take it away. (Sweeps in orchards of another simulator than ours, 30 trees in view: NEES 9 without it and 4 with it; in ours, with 10 in view, 2.3 and 1.9.)"""
+
+
 class GraphMethod:
     """Ours: submap, search, evidence, track (see `Engine`), lifted from the plane to six degrees of freedom."""
 
@@ -142,6 +147,7 @@ class GraphMethod:
         self._last_p = np.zeros((0, 3))
         self._seen_at = 0.0
         self._ground = GROUND_SIGMA**2
+        self._shared = 0.0
 
     def _begin(self, trunks: Trunks) -> Engine:
         """The index is built at the height at which this front end states its trunks."""
@@ -201,9 +207,9 @@ class GraphMethod:
         belief = replace(belief, pairs=np.stack([rows[belief.pairs[:, 0]], belief.pairs[:, 1]], axis=1))
         self._rise(leg, belief, trunks, flat)
         fix = self._fix(trunks.stamp_ns, belief, leg) if belief.pose is not None else None
-        along = self._row @ belief.cov[:2, :2] @ self._row
+        flat_cov = belief.cov[:2, :2] if fix is None else fix.cov[np.ix_([3, 4], [3, 4])]
         side = np.array([-self._row[1], self._row[0]])
-        across = side @ belief.cov[:2, :2] @ side
+        along, across = self._row @ flat_cov @ self._row, side @ flat_cov @ side
         ids = self.topo.ids[np.unique(belief.pairs[:, 1])]
         return Report(
             stamp_ns=trunks.stamp_ns,
@@ -242,6 +248,8 @@ class GraphMethod:
         x[0] += leg.up
         drift = (0.001 if leg.level else 0.02) ** 2 * leg.distance
         P += np.diag([(0.03 * leg.distance) ** 2 + 1e-6, drift, drift])
+        if self.engine is not None and len(belief.pairs):
+            self._shared = SHARED**2 * float(self.engine.index.var[belief.pairs[:, 1]].mean())
         for i, t in belief.pairs:
             self._ground += 0.02 * (GROUND_SIGMA**2 + _known(self.topo.cov[t, 2, 2]) - self._ground)
             ground = self.topo.p[t, 2] + (trunks.height[i] if np.isfinite(trunks.height[i]) else self.height)
@@ -266,6 +274,7 @@ class GraphMethod:
         cov[[3, 4], [3, 4]] += self._slip.standing**2
         # What all trees of the map, or all grounds under them, have in common no number of sightings takes away.
         cov[3:, 3:] += np.nan_to_num(self.topo.datum_cov)
+        cov[[3, 4], [3, 4]] += self._shared
         cov[5, 5] += self._ground
         if not leg.level:  # trunks that are seen so high above the base are shifted by the tilt, all alike
             cov[[3, 4], [3, 4]] += (UNKNOWN_TILT * self._seen_at) ** 2

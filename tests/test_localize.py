@@ -24,7 +24,7 @@ from topograph.localize.submap import Move, Submap, Sweep, Visibility
 from topograph.localize.thesis import multilaterate
 from topograph.motion import Leg, Reckoner
 from topograph.places.index import MapIndex, build_index
-from topograph.places.search import Landmarks, search
+from topograph.places.search import Found, Landmarks, search
 from topograph.simulate import DESIGNS, DriveConfig, SensorConfig, record
 from topograph.simulate.starts import SCENARIOS, StartsConfig, drive, world
 from topograph.topomap import TopoMap
@@ -241,6 +241,26 @@ def test_another_orchard_is_unknown() -> None:
         engine = Engine(index_of(w.mapped, config), config)
         for s in drive(v, c, np.random.default_rng([seed, 7]), 15.0):
             assert feed(engine, s, c).pose is None
+
+
+def test_what_a_search_left_out_overrules_no_track() -> None:
+    """Of two places the one that is held fits better, and the search has found the other alone; and the other way round."""
+    c = SCENARIOS["A"]
+    config = told(c)
+    w = world(c, np.random.default_rng(12))
+    engine = Engine(index_of(w.mapped, config), config)
+    for s in drive(w, c, np.random.default_rng(13), 6.0):
+        feed(engine, s, c)
+    assert engine.track is not None
+    h = engine.hunt
+    own = on_top(engine.track.mean[:3], h.submap.filter.mean[:3])
+    aside = own + [c.spacing, 0.0, 0.0]
+    marks, rows = describe(h.submap, engine.index, config)
+    beside = engine.track.moved(c.spacing, 0.0, 0.0, np.zeros(3))
+    for found, held, overruled in [(aside, engine.track, False), (own, beside, True)]:
+        h.found = Found(found[None], np.zeros(1), 0.0, 1)
+        h.posterior, h.rows = weigh(h.found, marks, h.submap, engine.index, config), rows
+        assert engine._fits_worse(held) == overruled
 
 
 @pytest.mark.parametrize("lattice", [False, True])

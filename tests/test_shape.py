@@ -8,7 +8,7 @@ import pytest
 from topograph.evaluate.metrics import match
 from topograph.geometry import from_xyz_rpy, inverse, transform
 from topograph.simulate.growth import _girth
-from topograph.trees import Detections, Shapes, TreesConfig, exists, grounds, shapes
+from topograph.trees import Detections, Shapes, TreesConfig, exists, feet, grounds, refine, shapes, tabulate
 from topograph.trunks.fit import LEAN_SIGMA_PRIOR
 
 HEIGHT = 0.8
@@ -101,6 +101,30 @@ def test_a_stem_seen_more_often_does_not_pull_the_axis() -> None:
     known = shapes(d, np.zeros(60, int), poses, 1, np.array([0]))
     assert known.stems[0] == 2  # counted,
     assert not known.forked[0]  # and stated at its own height all the same
+
+
+@pytest.mark.parametrize(
+    ("feet_apart", "slopes", "trees"),
+    [(0.3, (-0.25, 0.25), 1), (0.75, (0.0, 0.0), 2), (0.75, (0.2, 0.2), 2)],
+)
+def test_stems_of_one_foot_are_one_tree(feet_apart: float, slopes: tuple[float, float], trees: int) -> None:
+    """Two stems, 0.7 m apart where they are seen, which part from one foot, against trees that stand, or lean alike. Each scan
+    takes two thirds of the lean for granted to be none; what it measured, whole tracks know.
+    """
+    rng = np.random.default_rng(8)
+    poses = around(40, 6.0)
+    scan, track = np.repeat(np.arange(40), 2), np.tile([0, 1], 40)
+    foot = np.array([[-0.5, 0.0], [0.5, 0.0]]) * feet_apart
+    lean = np.stack([np.array(slopes), np.zeros(2)], axis=1)
+    place = foot[track] + HEIGHT * lean[track] + rng.normal(0, 0.02, (80, 2))
+    d = sighted(poses, place, lean[track] + rng.normal(0, 0.03, (80, 2)), track, scan, np.ones(80, np.int64))
+    shrunk = d.axis * [1 / 3, 1 / 3, 1.0]
+    d = replace(d, axis=shrunk / np.linalg.norm(shrunk, axis=1, keepdims=True))
+    np.testing.assert_allclose(feet(d, track, poses), foot[track], atol=0.08)
+    table = tabulate(d, track, poses, np.arange(40.0), feet(d, track, poses))
+    tree = refine(table, np.arange(2), TreesConfig())
+    assert len(np.unique(tree)) == trees
+    assert len(np.unique(refine(table, tree, TreesConfig()))) == trees  # and it stays so
 
 
 def test_recorded_axes_that_disagree_widen_the_lean() -> None:

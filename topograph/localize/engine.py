@@ -183,9 +183,6 @@ class Engine:
         found = next(h.search)
         if found is None:
             return False
-        if self.track is not None:  # whatever a search left out, the place that is held is a rival
-            own = on_top(self.track.mean[:3], h.submap.filter.mean[:3])
-            found = replace(found, pose=np.concatenate([found.pose, own[None]]), loss=np.append(found.loss, np.inf))
         h.search, h.found, h.informed = None, found, True
         marks, rows = describe(h.submap, self.index, c)
         h.posterior, h.rows = weigh(found, marks, h.submap, self.index, c), rows
@@ -366,13 +363,25 @@ class Engine:
                 other = anchored(h, self.index, c)
                 apart = np.hypot(*(other.mean[:2] - self.track.mean[:2]))
                 turn = abs((other.mean[2] - self.track.mean[2] + np.pi) % (2 * np.pi) - np.pi)
-                if apart > 1.0 + 3 * np.sqrt(self.track.cov[0, 0]) or turn > 0.2:
+                elsewhere = apart > 1.0 + 3 * np.sqrt(self.track.cov[0, 0]) or turn > 0.2
+                if elsewhere and self._fits_worse(self.track):
                     self.losses += 1
                     self._commit()
                     return
-                self.risk = p.risk
+                if not elsewhere:
+                    self.risk = p.risk
         if f.run >= c.shadow and h.search is None:
             self.hunt = _Hunt(submap=Submap(c, self.visibility))
+
+    def _fits_worse(self, held: Filter) -> bool:
+        """Whether the second opinion, as it is now, would not hold the `held` place for as likely as what may be overruled: a search may have
+        left it out."""
+        h, c = self.hunt, self.config
+        assert h.found is not None
+        own = on_top(held.mean[:3], h.submap.filter.mean[:3])
+        marks, _ = describe(h.submap, self.index, c)
+        there = weigh(replace(h.found, pose=own[None]), marks, h.submap, self.index, c)
+        return not len(there.log) or float(there.log[0] - h.posterior.log[0]) < np.log(OVERRULE * c.risk)
 
     def _lose(self, sweep: Sweep) -> None:
         """The evidence has turned: forget the pose and begin with this scan."""

@@ -97,7 +97,7 @@ class Bridge:
         self.heard = []
         report = self.localizer.report
         if fix is None:
-            self.said("searching" if report is None else f"{report.state}: {report.hypotheses} places fit")
+            self.said("searching" if report is None else f"{report.state}: {report.why}")
         else:
             self.found(fix, self.odom_T_base(fix.stamp_ns))
 

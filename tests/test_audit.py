@@ -135,6 +135,11 @@ def test_trees_that_stand_twice_are_counted() -> None:
     grid = np.stack(np.meshgrid(np.arange(6.0) * 4, np.arange(5.0) * 4), axis=2).reshape(-1, 2)
     assert audit.twice(grid) == 0.0
     assert audit.twice(np.concatenate([grid, grid[:8] + 0.4])) == pytest.approx(16 / 38)
+    for aside in (0.2, 0.4, 0.6):  # all of them
+        assert audit.twice(np.concatenate([grid, grid + aside])) == 1.0
+    rows = np.stack(np.meshgrid(np.arange(12) * 1.0, np.arange(4) * 2.5), axis=2).reshape(-1, 2)
+    assert audit.twice(rows) == 0.0
+    assert audit.twice(np.random.default_rng(0).uniform(0, 60, (400, 2))) < 0.12
 
 
 def test_a_lattice_that_was_laid_onto_itself_from_afar_is_doubted() -> None:

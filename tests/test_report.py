@@ -82,7 +82,7 @@ def seen(state: str, along: float = 0.02) -> Report:
         ([seen("tracking")] * 9 + [seen("lost")], "fair", ["lost at the end", "90.0 %"]),
         ([seen("searching")] * 10, "bad", ["unknown"]),
         (
-            [replace(seen("searching"), why="so regular", hypotheses=3)] * 10,
+            [replace(seen("ambiguous"), fix=None, why="so regular", hypotheses=3)] * 10,
             "bad",
             ["unknown: so regular", "3 are left"],
         ),

@@ -48,6 +48,8 @@ DRIFT = (0.05, 6.0)
 JUMP, JUMP_FIXES, JUMP_S = (0.33, 8.0), 8, 6.0
 """A step of the fixes against dead reckoning, m and stated deviations, between the medians of so many fixes before and after it, all within
 so many seconds (clean: up to 0.21 m, in tight turns)."""
+TOLD = 4.0
+"""Deviations of the less sure side that a step may be long."""
 OUTVOTED = 0.25
 """Share of the fixes that three quarters which agree with wheels, trunks and each other outvote."""
 JUMP_WIDE = 0.3
@@ -167,9 +169,9 @@ def jumps(problem: Problem, estimate: Estimate, streams: Streams, lever: Array) 
             continue  # scattered outliers, not two places
         if outvoted and _left_behind(off, refused, i, step):
             continue  # a few are elsewhere for a while, and the solve has not followed them
-        # A receiver that says that it floats from here on has told of the step.
+        # A receiver that says that it floats on one side has told of the step.
         stated = max(float(np.median(part)) for part in (sigma[mine][:JUMP_FIXES], sigma[mine][JUMP_FIXES:]))
-        bound = max(JUMP[0], JUMP[1] * stated)
+        bound = max(JUMP[0], JUMP[1] * float(np.median(sigma[mine])), TOLD * stated)
         if step > bound and step / bound > worst / most:
             worst, when, most = step, (fix_ns[i] - motion.stamps_ns[0]) * 1e-9, bound
     if worst > 0:
@@ -377,11 +379,13 @@ SEEN_ANEW = 12.0
 def twice(xy: Array) -> float:
     """Share of trees (T, 2) that have another one nearer than a quarter of the usual distance; 0 where they are fewer than PAIRS pairs.
 
-    Where most are there twice, their second one is the usual distance: the third nearest is another tree's.
+    Where most are there twice, what is usual is the distance to their second one: then each is held against its third nearest, which is another tree's (of
+    trees that stand at random 0.17 have one so near, in rows none).
     """
     if len(xy) < 6:
         return 0.0
     distance = np.asarray(cKDTree(xy).query(xy, k=4)[0])
-    usual = np.median(distance, axis=0)
-    near = distance[:, 1] < max(0.25 * usual[1], 0.15 * usual[3])
+    near = distance[:, 1] < 0.25 * np.median(distance[:, 1])
+    twofold = distance[:, 1] < 0.3 * distance[:, 3]
+    near |= twofold & (twofold.mean() > 0.5)
     return float(near.mean()) if near.sum() >= 2 * PAIRS else 0.0

@@ -32,12 +32,16 @@ DRAGGED_AGAIN = 5.0
 CROWD, FEW = 3.0, 0.3
 """Where more trees than this should be seen, and fewer than this share of them are, the pose is in doubt at once."""
 NO_PAIRS = np.zeros((0, 2), np.int64)
-LITTLE, SEVERAL, ALIKE, ELSEWHERE = REASONS = (
+LITTLE, COARSE, SEVERAL, ALIKE, ELSEWHERE, CONTRADICTED = REASONS = (
     "too few trees were seen to tell places apart",
+    "trees are known too badly for how densely they stand",
     "several places of the map fit",
     "the planting is so regular that another one of its design would fit as well (if that cannot be, set localize.alike to 1e-9)",
     "nothing on this map fits what was seen well enough",
+    "wheels or gyro contradict the trees for so long that nobody is believed",
 )
+SET_ASIDE = 1e-5
+"""Of the prior of another orchard of this design, what is left where somebody says that it cannot be (`ALIKE`)."""
 STATES = ("searching", "ambiguous", "tracking", "degraded", "lost")
 
 
@@ -100,6 +104,7 @@ class Engine:
         self._dragged_at = -np.inf
         self._met = np.zeros(2)
         self.losses = 0
+        self._blinded = False
 
     def step(
         self, move: Move, sweep: Sweep, doubted: Move | None = None, slips: bool = False, blinded: bool = False
@@ -109,6 +114,7 @@ class Engine:
         when it is bent is another one. `slips`: it is the way that is contradicted; `blinded`: for so long that nobody is
         believed.
         """
+        self._blinded = blinded
         if blinded:
             if self.track is not None:
                 self._lose(sweep)
@@ -440,12 +446,16 @@ class Engine:
 
     def _why(self, places: int) -> str:
         """What stands against a commit, with so many `places` left."""
-        p = self.hunt.posterior
+        h, p = self.hunt, self.hunt.posterior
+        if self._blinded:
+            return CONTRADICTED
         if not len(p.p):
-            return ELSEWHERE if self.hunt.informed else LITTLE
-        if p.unknown > self.config.risk and p.alike > 0.5 * p.unknown and p.unknown > 0.5 * p.risk:
-            return ALIKE
-        return SEVERAL if places > 1 or p.unknown < 0.5 * p.risk else ELSEWHERE
+            return LITTLE if not h.informed else COARSE if h.found is not None and not h.found.seeds else ELSEWHERE
+        if p.unknown < 0.5 and p.alike < 0.5 * p.risk:
+            return SEVERAL
+        aside = SET_ASIDE * p.alike
+        rest = 1.0 - p.alike + aside
+        return ALIKE if (rest - p.p[0]) < 0.01 * rest else SEVERAL if p.unknown < 0.5 else ELSEWHERE
 
 
 def on_top(map_pose: Array, frame_pose: Array) -> Array:

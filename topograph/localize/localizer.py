@@ -207,7 +207,9 @@ class GraphMethod:
         belief = replace(belief, pairs=np.stack([rows[belief.pairs[:, 0]], belief.pairs[:, 1]], axis=1))
         self._rise(leg, belief, trunks, flat)
         fix = self._fix(trunks.stamp_ns, belief, leg) if belief.pose is not None else None
-        flat_cov = belief.cov[:2, :2] if fix is None else fix.cov[np.ix_([3, 4], [3, 4])]
+        flat_cov = belief.cov[:2, :2]
+        if fix is not None:  # all that is open of the place in the map; where the map lies on Earth is another matter
+            flat_cov = fix.cov[np.ix_([3, 4], [3, 4])] - np.nan_to_num(self.topo.datum_cov)[:2, :2]
         side = np.array([-self._row[1], self._row[0]])
         along, across = self._row @ flat_cov @ self._row, side @ flat_cov @ side
         ids = self.topo.ids[np.unique(belief.pairs[:, 1])]

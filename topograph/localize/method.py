@@ -43,7 +43,7 @@ class Report:
         trees: ids of the mapped trees seen.
         pairs: (K, 2) rows of the scan's trunks and of the map's trees.
         why: while there is no pose, what stands against one, in words; else "".
-        along, across: standard deviations of the position along and across the rows (east and north without rows), m.
+        along, across: standard deviations of the position in the map, along and across the rows (east and north without rows), m.
     """
 
     stamp_ns: int

@@ -224,7 +224,8 @@ ENOUGH = 9
 """Trees from which the planting's irregularity is measured."""
 STRAYED = 30.0
 """Squared Mahalanobis distance from where dead reckoning and GNSS have it (3 dof; by chance once in a million): however well a lattice fits there, it is
-another place. A vineyard driven with RTK was laid onto itself three vines further on."""
+another place. A vineyard driven with RTK was laid onto itself three vines further on. (Where trees stand at random, wheels that are worse than they are said to
+be are likelier than a chance fit.)"""
 REGULAR = 1.0
 """Squares of the jitter, in variances of where trees are, below which a lattice looks the same from every row: a row beside costs twice that per tree, in nats."""
 SCATTERED = 5
@@ -291,13 +292,14 @@ def recognise(
         beside = int((apart[near] < AROUND).sum())
         beyond = float(marks.other.sum()) + beside * np.log(1.0 - SHOWN)
     surer = float(among[best] - np.logaddexp.reduce([*rivals, rest, beyond]))
-    if log[best] - new_ground < margin or surer < RIVAL * margin or strayed[best] > STRAYED:
+    regular = jitter**2 < REGULAR * variance
+    if log[best] - new_ground < margin or surer < RIVAL * margin or (regular and strayed[best] > STRAYED):
         return None
     move = off @ np.linalg.solve(total[best], away[best])  # as far as the drift allows
     moved = float(np.abs(_moved(move, here - centre) - (here - centre)).max())
     rows = np.flatnonzero(placed.tree[best] >= 0)
     pairs = [(int(i), int(near[placed.tree[best, i]])) for i in rows]
-    slid = float(np.hypot(*move[:2])) / gap if jitter**2 < REGULAR * variance else 0.0
+    slid = float(np.hypot(*move[:2])) / gap if regular else 0.0
     return Recognised(pairs=pairs, move=move, centre=centre, moved=moved, slid=slid)
 
 

@@ -203,7 +203,11 @@ def verdict(reports: Sequence[Any], distance: Sequence[float]) -> str:
         ]
         return "; ".join(parts)
     last = reports[-1]
-    left = f" ({last.hypotheses} are left, up to {last.apart:.0f} m apart)" if last.state == "ambiguous" else ""
+    left = (
+        f" ({last.hypotheses} are left, up to {last.apart:.0f} m apart)"
+        if last.state == "ambiguous" and last.hypotheses > 1
+        else ""
+    )
     return f"unknown: {last.why or 'no place was found'}{left}"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
@@ -44,15 +45,15 @@ def place(topo: TopoMap, session: Session, config: Config, progress: Progress = 
     ahead = next(messages, None)
     stamps: list[int] = []
     poses: list[Array] = []
-    states = set()
+    reasons: Counter[str] = Counter()
     for n, trunks in enumerate(session.trunks):
         heard = []
         while ahead is not None and ahead.stamp_ns <= trunks.stamp_ns + AHEAD_NS:
             heard.append(ahead)
             ahead = next(messages, None)
         fix = localizer.update(trunks, heard)
-        if localizer.report is not None:
-            states.add(localizer.report.state)
+        if localizer.report is not None and localizer.report.why:
+            reasons[localizer.report.why] += 1
         if fix is not None:
             stamps.append(fix.stamp_ns)
             poses.append(fix.map_T_robot)
@@ -61,9 +62,9 @@ def place(topo: TopoMap, session: Session, config: Config, progress: Progress = 
     progress("place", 1.0)
     kept = spread(np.array(poses).reshape(-1, 4, 4))
     if len(kept) < LEAST:
-        why = "several places fit it" if "ambiguous" in states else "no place fits it well enough"
+        why = reasons.most_common(1)[0][0] if reasons else "too few of its scans could be placed"
         raise InsufficientDataError(
-            f"the run has no GNSS in common with the map, and was not found in it by its trees ({why}): drive further, or through more of "
+            f"the run has no GNSS in common with the map, and was not found in it by its trees: {why}. Drive further, or through more of "
             "what the map knows"
         )
     return Placed(np.array(stamps, np.int64)[kept], np.array(poses)[kept])

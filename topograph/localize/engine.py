@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from topograph.geometry import Array
+from topograph.geometry import Array, inverse, planar
 from topograph.localize.config import LocalizeConfig
 from topograph.localize.filter import Filter
 from topograph.localize.filter_kernels import assign, in_view
@@ -441,11 +441,11 @@ class Engine:
             places=places,
             weights=p.p[: len(places)],
             pairs=pairs,
-            why=self._why(n),
+            why=self._why(),
         )
 
-    def _why(self, places: int) -> str:
-        """What stands against a commit, with so many `places` left."""
+    def _why(self) -> str:
+        """What stands against a commit."""
         h, p = self.hunt, self.hunt.posterior
         if self._blinded:
             return CONTRADICTED
@@ -460,10 +460,8 @@ class Engine:
 
 def on_top(map_pose: Array, frame_pose: Array) -> Array:
     """Pose (3,) x, y, yaw in the map of a frame in which the robot is at `frame_pose` (3,), when it is at `map_pose` (3,)."""
-    yaw = map_pose[2] - frame_pose[2]
-    c, s = np.cos(yaw), np.sin(yaw)
-    x, y = frame_pose[:2]
-    return np.array([map_pose[0] - c * x + s * y, map_pose[1] - s * x - c * y, yaw])
+    x, y = (planar(*map_pose) @ inverse(planar(*frame_pose)))[:2, 3]
+    return np.array([x, y, map_pose[2] - frame_pose[2]])
 
 
 def anchored(hunt: _Hunt, index: MapIndex, config: LocalizeConfig) -> Filter:

@@ -63,10 +63,10 @@ class Association:
         """map_T_scan (S, 4, 4)."""
         return path_at(e.stamps_ns, e.map_T_robot, self.problem.motion, self.problem.detections.stamps_ns)
 
-    def table(self, e: Estimate, *, settled: bool = False) -> TrackTable:
-        """Tracks in the map as estimated, with their feet along their own axes where the path has `settled`; trees of an earlier map are tracks seen
-        long ago."""
-        d, map_T_scan = self.problem.detections, self.poses(e)
+    def table(self, map_T_scan: Array, *, settled: bool = False) -> TrackTable:
+        """Tracks in the map as seen from map_T_scan (S, 4, 4), with their feet along their own axes where the path has `settled`; trees of an earlier
+        map are tracks seen long ago."""
+        d = self.problem.detections
         foot = feet(d, self.track, map_T_scan) if settled else None
         t = tabulate(d, self.track, map_T_scan, self.problem.motion.distance_at(d.stamps_ns), foot)
         k = self.problem.known
@@ -120,9 +120,8 @@ class Association:
     def decide(self, e: Estimate) -> Decided:
         """What there is, given an estimate."""
         c, d = self.config.trees, self.problem.detections
-        t = self.table(e, settled=True)
-        self.tree_of_track = self.named(refine(t, self.tree_of_track, c))
         map_T_scan = self.poses(e)
+        self.tree_of_track = self.named(refine(self.table(map_T_scan, settled=True), self.tree_of_track, c))
         tree, ids = self.trees(self.tree_of_track, 1)
         seen = transform(map_T_scan[d.scan], d.p)
         count = np.maximum(np.bincount(tree, minlength=len(ids)), 1)
@@ -192,7 +191,7 @@ def associate_and_solve(
     if guess is not None:
         estimate = a.solve(replace(estimate, map_T_robot=guess))
     cap = _gnss_cap(problem, a.way(estimate), config)
-    while a.closer.advance(a.table(estimate), a.way(estimate), end, cap):
+    while a.closer.advance(a.table(a.poses(estimate)), a.way(estimate), end, cap):
         progress("associate", min(1.0, a.closer.at / max(end, 1e-9)))
         a.tree_of_track = a.closer.tree
         estimate = a.shut(estimate)
@@ -202,7 +201,8 @@ def associate_and_solve(
     for n, patience in enumerate((4.0, 2.0, 1.0) if config.trees.reassociate else ()):
         progress("refine", n / 3)
         before = a.tree_of_track
-        a.tree_of_track = a.named(refine(a.table(estimate, settled=True), before, config.trees, patience))
+        table = a.table(a.poses(estimate), settled=True)
+        a.tree_of_track = a.named(refine(table, before, config.trees, patience))
         if not np.array_equal(a.tree_of_track, before):
             estimate = a.solve(estimate, patient=True)
     progress("solve", 0.0)

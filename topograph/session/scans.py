@@ -129,14 +129,13 @@ class Scans(Sequence[Trunks]):
             return parts.pop()
         scans, rows, points = (sum(q) for q in zip(*((len(q), len(q.p), len(q.points)) for q in parts), strict=True))
         told = any(len(q.free) for q in parts)
-        length = {"points": points, "free": scans * told, **dict.fromkeys(_SCANS, scans), **dict.fromkeys(ROWS, rows)}
         same = {
             k: np.broadcast_to(v, (rows, *v.shape))
             for k in ROWS
             if (v := _same([getattr(q, k) for q in parts])) is not None
         }
-        for k in same:
-            del length[k]
+        own = [k for k in ROWS if k not in same]
+        length = {"points": points, "free": scans * told, **dict.fromkeys(_SCANS, scans), **dict.fromkeys(own, rows)}
         whole = {k: np.zeros((n, *(v := getattr(parts[0], k)).shape[1:]), v.dtype) for k, n in length.items()}
         at = dict.fromkeys(length, 0)
         frames: list[str] = []
@@ -213,13 +212,13 @@ class ScansBuilder:
 
 
 def _columns(trunks: Sequence[Trunks]) -> Scans:
-    def rows(name: str, *shape: int, missing: float = 0.0) -> Array:
+    def rows(name: str, *shape: int, missing: float = 0.0, dtype: type = float) -> NDArray[Any]:
         if not any(len(getattr(t, name)) for t in trunks):
-            return np.broadcast_to(np.full(shape, missing), (sum(map(len, trunks)), *shape))
-        parts = [np.zeros((0, *shape))]
+            return np.broadcast_to(np.full(shape, missing, dtype), (sum(map(len, trunks)), *shape))
+        parts: list[NDArray[Any]] = [np.zeros((0, *shape), dtype)]
         for t in trunks:
-            part = np.asarray(getattr(t, name), float)
-            parts.append(part if len(part) == len(t) else np.full((len(t), *shape), missing))
+            part: NDArray[Any] = np.asarray(getattr(t, name), dtype)
+            parts.append(part if len(part) == len(t) else np.full((len(t), *shape), missing, dtype))
         return np.concatenate(parts)
 
     n = len(trunks)
@@ -232,12 +231,11 @@ def _columns(trunks: Sequence[Trunks]) -> Scans:
         if looked:
             free[k] = t.free
     clouds = [c for t in trunks for c in (t.clouds or [_NOTHING] * len(t))]
-    p, stems = rows("p", 3), rows("stems", missing=1.0)
     return Scans(
         stamps_ns=np.array([t.stamp_ns for t in trunks], np.int64),
         frames=tuple(t.frame for t in trunks),
         ends=_sum(np.array([len(t) for t in trunks], np.int64)),
-        p=p,
+        p=rows("p", 3),
         axis=rows("axis", 3),
         diameter=rows("diameter"),
         cov=rows("cov", 3, 3),
@@ -245,7 +243,7 @@ def _columns(trunks: Sequence[Trunks]) -> Scans:
         score=rows("score"),
         kinds=rows("kinds", 3, missing=np.nan),
         measured=rows("measured", 6),
-        stems=np.broadcast_to(np.int64(1), len(p)) if alike(stems) else stems.astype(np.int64),
+        stems=rows("stems", missing=1, dtype=np.int64),
         free=free if any(len(t.free) == SECTORS for t in trunks) else free[:0],
         eye=np.array([t.eye for t in trunks], float).reshape(-1, 3),
         points=np.concatenate([_NOTHING, *clouds]).astype(np.float32, copy=False),

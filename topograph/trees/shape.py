@@ -262,7 +262,7 @@ def feet(detections: Detections, track: NDArray[np.int64], map_T_scan: Array) ->
     """
     d, n = detections, int(track.max(initial=-1)) + 1
     slope, weight = _slopes(d, map_T_scan)
-    weight = ALIKE * np.minimum(weight, 1.0 / 0.03**2)
+    weight = _counted(weight)
     total = np.bincount(track, weight, n) + 1.0 / LEAN_PRIOR**2
     lean = np.stack([np.bincount(track, weight * slope[:, k], n) / total for k in range(2)], axis=1)
     _, middle, lever = _places(d, map_T_scan)
@@ -270,12 +270,17 @@ def feet(detections: Detections, track: NDArray[np.int64], map_T_scan: Array) ->
     return np.asarray(middle - above[:, None] * lean[track])
 
 
+def _counted(weight: Array) -> Array:
+    """What slopes of information `weight` (N,) count for beside others of the same column: none is better than 0.03, and they err alike."""
+    return ALIKE * np.minimum(weight, 1.0 / 0.03**2)
+
+
 def _together(slope: Array, weight: Array) -> tuple[Array, Array]:
     """Mean slope (2,) with the prior, robust to sightings of something else, and the weight (M,) that each was given."""
     prior = 1.0 / LEAN_PRIOR**2
     if weight.sum() <= 0:
         return np.zeros(2), np.zeros(len(weight))
-    w = ALIKE * np.minimum(weight, 1.0 / 0.03**2)
+    w = _counted(weight)
     mean = np.asarray(w @ slope / w.sum())
     for _ in range(4):
         e2 = np.sum((slope - mean) ** 2, axis=1)

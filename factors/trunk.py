@@ -29,8 +29,15 @@ def trunk(pose_key: int, point_key: int, robot_p_trunk: ArrayLike, cov: ArrayLik
     return trunks([pose_key], [point_key], p, np.asarray(cov, float)[None], kernel)[0]
 
 
-def trunks(pose_keys: list[int], point_keys: list[int], robot_p_trunk: Array, cov: Array, kernel: Kernel) -> list[Any]:
+def trunks(
+    pose_keys: list[int], point_keys: list[int], robot_p_trunk: Array, cov: Array, kernel: Kernel,
+    *, expected: Array | None = None,
+) -> list[Any]:  # fmt: skip
     """`trunk` for N sightings at once: points (N, 3), covariances (N, 3, 3); checks and algebra are done in bulk.
+
+    GTSAM states a bearing's error in the basis at the *predicted* direction, and across the least of the axes that basis turns by 90°: a trunk
+    straight abeam would have its height weighed as its side. `expected` (N, 3) is where the values to begin from have the trunks on the
+    robot, m; the measurements themselves where it is not given.
 
     Raises:
         ValueError: as `trunk`.
@@ -39,7 +46,8 @@ def trunks(pose_keys: list[int], point_keys: list[int], robot_p_trunk: Array, co
     if not (np.isfinite(distance).all() and (distance >= 0.01).all()):
         raise ValueError("a trunk must be finite and not inside the sensor")
     unit = robot_p_trunk / distance[:, None]
-    J = np.concatenate([np.swapaxes(bearing_basis(unit), 1, 2) / distance[:, None, None], unit[:, None, :]], axis=1)
+    basis = bearing_basis(unit if expected is None else expected / np.linalg.norm(expected, axis=1, keepdims=True))
+    J = np.concatenate([np.swapaxes(basis, 1, 2) / distance[:, None, None], unit[:, None, :]], axis=1)
     turned = J @ cov @ np.swapaxes(J, 1, 2)
     turned = 0.5 * (turned + np.swapaxes(turned, 1, 2))
     if not np.isfinite(turned).all() or (len(turned) and np.linalg.eigvalsh(turned)[:, 0].min() <= 0):

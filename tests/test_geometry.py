@@ -83,3 +83,9 @@ def test_align_se3_never_mirrors() -> None:
     R = g.align_se3(p, p * [1.0, 1.0, -1.0])[:3, :3]
     assert np.linalg.det(R) == pytest.approx(1.0)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
+
+
+@given(arrays(float, (3, 3), elements=st.floats(-1, 1)))
+def test_information_inverts_covariance(root: np.ndarray) -> None:
+    cov = root @ root.T + 1e-4 * np.eye(3)
+    np.testing.assert_allclose(g.inverse_cov(np.stack([cov, cov]))[1] @ cov, np.eye(3), atol=1e-8)

@@ -41,19 +41,39 @@ def orthonormal(poses: Array) -> Array:
     return out
 
 
+def path_of(problem: Problem, values: Any) -> Array:
+    """map_T_robot (K, 4, 4) in GTSAM's values."""
+    rows = gtsam.utilities.extractPose3(values)  # rotation (9), translation (3), in key order
+    out = np.tile(np.eye(4), (len(problem.stamps_ns), 1, 1))
+    out[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
+    out[:, :3, 3] = rows[:, 9:]
+    return out
+
+
+def trees_of(problem: Problem, values: Any) -> Array:
+    """Trees (T, 3) in GTSAM's values."""
+    return np.array([values.atPoint3(L + j) for j in problem.names().tolist()]).reshape(-1, 3)
+
+
 def factors_of(
-    problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | None, *, without: Container[str] = ()
+    problem: Problem,
+    p: Pass,
+    config: EstimateConfig,
+    inert: Inertia | None,
+    values: Any,
+    *,
+    without: Container[str] = (),
 ) -> Iterator[tuple[str, Any]]:
     """Every factor of the problem once, with its kind: "motion", "odometry", "imu", "fix", "link", "heading", "trunk", "tree".
 
-    Kinds in `without` are left out, and not built.
+    `values` are those that a solve begins from; kinds in `without` are left out, and not built.
     """
     yield from ((kind, f) for kind, f in motion_factors(problem, inert) if kind not in without)
     parts = (
         ("fix", _fixes(problem, p)),
         ("link", _links(problem)),
         ("heading", _headings(problem, config)),
-        ("trunk", _trunks(problem, p)),
+        ("trunk", _trunks(problem, p, values)),
         ("tree", _tree_priors(problem, p.height)),
     )
     for kind, part in parts:  # generators: what is left out has not begun
@@ -62,11 +82,17 @@ def factors_of(
 
 
 def graph_of(
-    problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | None, *, without: Container[str] = ()
+    problem: Problem,
+    p: Pass,
+    config: EstimateConfig,
+    inert: Inertia | None,
+    values: Any,
+    *,
+    without: Container[str] = (),
 ) -> Any:
-    """A NonlinearFactorGraph of the factors whose kind is not in `without`."""
+    """A NonlinearFactorGraph of the factors whose kind is not in `without`; see `factors_of`."""
     g = gtsam.NonlinearFactorGraph()
-    for _, f in factors_of(problem, p, config, inert, without=without):
+    for _, f in factors_of(problem, p, config, inert, values, without=without):
         g.add(f)
     return g
 
@@ -83,10 +109,12 @@ def _headings(problem: Problem, config: EstimateConfig) -> Iterator[Any]:
     yield from factors.headings((X + h.keyframe).tolist(), h.yaw, h.direction, sigma, Kernel("huber", 1.345))
 
 
-def _trunks(problem: Problem, p: Pass) -> Iterator[Any]:
+def _trunks(problem: Problem, p: Pass, values: Any) -> Iterator[Any]:
     s = problem.sightings
     keys = (X + s.keyframe).tolist(), (L + problem.names()[s.tree]).tolist()
-    yield from factors.trunks(*keys, s.p, p.trunk_scale**2 * s.cov, p.trunk)
+    robot_T_map = inverse(path_of(problem, values))
+    expected = transform(robot_T_map[s.keyframe], trees_of(problem, values)[s.tree])
+    yield from factors.trunks(*keys, s.p, p.trunk_scale**2 * s.cov, p.trunk, expected=expected)
 
 
 def _tree_priors(problem: Problem, height: float) -> Iterator[Any]:

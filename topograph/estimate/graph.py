@@ -21,7 +21,7 @@ import factors
 from factors import Kernel
 from topograph.errors import InsufficientDataError
 from topograph.estimate import covariance
-from topograph.estimate.generator import B, L, Pass, V, X, fix_cov, graph_of, orthonormal
+from topograph.estimate.generator import B, L, Pass, V, X, fix_cov, graph_of, orthonormal, path_of, trees_of
 from topograph.estimate.inertia import Inertia, inertia
 from topograph.estimate.initial import initial_path, yaw_of_direction
 from topograph.estimate.offsets import tested
@@ -34,6 +34,9 @@ _NONE = Kernel("none")
 _log = logging.getLogger(__name__)
 
 
+NEAR, MINIMUM = 1e-3, 1e-4
+"""Share of the error below which a step's gain ends a pass: where association goes on at once, and else. What is left are millimetres; the exact
+steps at the end take them out."""
 RELEARNT, STALE = 4, 0.6
 """Under Huber, wrong fixes bend the path, and what they bend is learnt as noise of the trunks. Where the residuals of the last
 pass shrink below this share of the noise, it is learnt again, at most so often."""
@@ -92,31 +95,35 @@ def quick(problem: Problem, config: EstimateConfig, *, patient: bool = False) ->
     problem, values = _begun(problem, config, config.quick_sightings, None)
     huber = Kernel("huber", config.huber)
     first = Pass(trunk=huber, fix=huber, fix_floor=0.05, height=QUICK_HEIGHT)
-    steps, tolerance = (3 * config.iterations, 1e-5) if patient else (10, 1e-3)
-    values = optimised(graph_of(problem, first, config, None), values, steps, tolerance)
+    steps, tolerance = (3 * config.iterations, MINIMUM) if patient else (10, NEAR)
+    values = optimised(graph_of(problem, first, config, None, values), values, steps, tolerance)
     return _estimate(problem, config, values, first, None, time.perf_counter() - began)
 
 
 @_determined()
-def converge(problem: Problem, config: EstimateConfig) -> Converged:
-    """The robust passes of `solve`. Raises as it does."""
+def converge(problem: Problem, config: EstimateConfig, former: Converged | None = None) -> Converged:
+    """The robust passes of `solve`; from `former`, of the same run with other trees, come inertia, velocities and biases. Raises as it does."""
     began = time.perf_counter()
-    inert = inertia(problem) if config.use_imu else None
+    inert = former.inert if former is not None else inertia(problem) if config.use_imu else None
     problem, values = _begun(problem, config, config.most_sightings, inert)
+    if former is not None and inert is not None:
+        for k in range(len(problem.stamps_ns)):
+            values.update(V + k, former.values.atVector(V + k))
+            values.update(B + k, former.values.atConstantBias(B + k))
     huber = Kernel("huber", config.huber)
     first = Pass(trunk=huber, fix=huber, fix_floor=0.0)
-    values = optimised(graph_of(problem, first, config, inert), values, 3 * config.iterations, 1e-6)
+    values = optimised(graph_of(problem, first, config, inert, values), values, 3 * config.iterations, MINIMUM)
     scales = _learned_scales(problem, values, first) if config.learn_scale else (1.0, 1.0, 1.0)
     tukey = Kernel("tukey", config.tukey)
     last = Pass(trunk=tukey, fix=tukey, trunk_scale=scales[0], fix_scale=scales[1], alike=scales[2])
-    values = optimised(graph_of(problem, last, config, inert), values, config.iterations)
+    values = optimised(graph_of(problem, last, config, inert, values), values, config.iterations, MINIMUM)
     for _ in range(RELEARNT if config.learn_scale else 0):
         scales = _learned_scales(problem, values, last)
         if scales[0] > STALE * last.trunk_scale and scales[1] > STALE * last.fix_scale:
             break
         less = (min(scales[0], last.trunk_scale), min(scales[1], last.fix_scale))
         last = replace(last, trunk_scale=less[0], fix_scale=less[1], alike=scales[2])
-        values = optimised(graph_of(problem, last, config, inert), values, config.iterations)
+        values = optimised(graph_of(problem, last, config, inert, values), values, config.iterations, MINIMUM)
     estimate = _estimate(problem, config, values, last, None, time.perf_counter() - began)
     return Converged(problem, last, inert, values, estimate, began)
 
@@ -176,8 +183,8 @@ def _poses_alone(problem: Problem, poses: Array, config: EstimateConfig) -> Arra
             Pass(trunk=_NONE, fix=Kernel("huber", 1.345), fix_floor=1.0),
             Pass(trunk=_NONE, fix=Kernel("cauchy", 1.0), fix_floor=0.1),
         ):
-            values = optimised(graph_of(problem, p, config, None, without=("trunk", "tree")), values, 30, 1e-4)
-    return _path(problem, values)
+            values = optimised(graph_of(problem, p, config, None, values, without=("trunk", "tree")), values, 30, 1e-4)
+    return path_of(problem, values)
 
 
 def _values(problem: Problem, poses: Array, trees: Array, inert: Inertia | None) -> Any:
@@ -211,30 +218,18 @@ def _median_trees(problem: Problem, poses: Array) -> Array:
     return trees
 
 
-def _path(problem: Problem, values: Any) -> Array:
-    rows = gtsam.utilities.extractPose3(values)  # rotation (9), translation (3), in key order
-    out = np.tile(np.eye(4), (len(problem.stamps_ns), 1, 1))
-    out[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
-    out[:, :3, 3] = rows[:, 9:]
-    return out
-
-
-def _trees(problem: Problem, values: Any) -> Array:
-    return np.array([values.atPoint3(L + j) for j in problem.names().tolist()]).reshape(-1, 3)
-
-
 def _trunk_residuals(problem: Problem, values: Any, scale: float) -> Array:
     """Whitened Cartesian residuals (M, 3) of the sightings."""
     s = problem.sightings
     if len(s) == 0:
         return np.zeros((0, 3))
-    e, _, _ = factors.trunk_residual(_path(problem, values)[s.keyframe], _trees(problem, values)[s.tree], s.p)
+    e, _, _ = factors.trunk_residual(path_of(problem, values)[s.keyframe], trees_of(problem, values)[s.tree], s.p)
     return np.asarray(np.linalg.solve(np.linalg.cholesky(s.cov) * scale, e[..., None])[..., 0])
 
 
 def _fix_residuals(problem: Problem, values: Any) -> Array:
     f = problem.fixes
-    return np.asarray(transform(_path(problem, values)[f.keyframe], f.keyframe_p_antenna) - f.map_p_antenna)
+    return np.asarray(transform(path_of(problem, values)[f.keyframe], f.keyframe_p_antenna) - f.map_p_antenna)
 
 
 def _learned_scales(problem: Problem, values: Any, p: Pass) -> tuple[float, float, float]:
@@ -270,7 +265,7 @@ POLISHED = 2e-5
 def _polish(problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | None, values: Any) -> tuple[Any, Any]:
     """Gauss-Newton with Cartesian trunk residuals until steps are below `POLISHED`; the values and the last system."""
     ordering = None
-    rest = graph_of(problem, p, config, inert, without=("trunk",))
+    rest = graph_of(problem, p, config, inert, values, without=("trunk",))
     s = problem.sightings
     keys_x, keys_l = (X + s.keyframe).tolist(), (L + problem.names()[s.tree]).tolist()
     cov = p.trunk_scale**2 * s.cov
@@ -278,7 +273,7 @@ def _polish(problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | 
     for _ in range(8):
         linear = rest.linearize(values)
         if len(s):
-            path, trees = _path(problem, values), _trees(problem, values)
+            path, trees = path_of(problem, values), trees_of(problem, values)
             factors.trunk_linear(linear, keys_x, keys_l, path[s.keyframe], trees[s.tree], s.p, cov, p.trunk)
         ordering = ordering or ordering_of(linear, values.size())
         step = linear.optimize(ordering)
@@ -289,7 +284,7 @@ def _polish(problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | 
 
 
 def _estimate(problem: Problem, config: EstimateConfig, values: Any, p: Pass, linear: Any, seconds: float) -> Estimate:
-    poses, trees = _path(problem, values), _trees(problem, values)
+    poses, trees = path_of(problem, values), trees_of(problem, values)
     # What a known map's frame is off by is in its trees' covariances already.
     datum_cov = covariance.of_datum(problem, p.fix_scale, config) if problem.known is None else np.zeros((3, 3))
     joint = None
@@ -321,7 +316,7 @@ def _residual_stamps(problem: Problem, residuals: dict[str, Array]) -> dict[str,
 
 
 def _other_residuals(problem: Problem, values: Any, p: Pass, config: EstimateConfig) -> dict[str, Array]:
-    poses = _path(problem, values)
+    poses = path_of(problem, values)
     step = inverse(problem.odom_T_robot[:-1]) @ problem.odom_T_robot[1:]
     misfit = log(inverse(step) @ inverse(poses[:-1]) @ poses[1:]) / problem.step_sigma
     out = {"odometry": misfit[:, 3:5].ravel(), "turn": misfit[:, 2]}

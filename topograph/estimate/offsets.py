@@ -24,7 +24,7 @@ def tested(
     Each is a column of one more variable in the linear system of the solution, eliminated last. What it would have to be off
     by, and how much better the residuals would be, follow without solving anew.
     """
-    g = graph_of(problem, p, config, inert, without=("trunk", "fix", "odometry")).linearize(values)
+    g = graph_of(problem, p, config, inert, values, without=("trunk", "fix", "odometry")).linearize(values)
     s, f = problem.sightings, problem.fixes
     if problem.pose_sigma is None:
         step = inverse(problem.odom_T_robot[:-1]) @ problem.odom_T_robot[1:]

@@ -209,9 +209,10 @@ def associate_and_solve(
     del a.seen  # as large as the detections, and from here on each decision makes its own
     after = a.decide(estimate)
     earlier: list[_Made] = []
+    converged: graph.Converged | None = None
     for n in range(LAST_ROUNDS if config.trees.reassociate else 1):
         decided = after
-        converged = graph.converge(decided.problem, config.estimate)
+        converged = graph.converge(decided.problem, config.estimate, converged)
         progress("solve", (n + 1) / LAST_ROUNDS)
         after = a.decide(converged.estimate)
         made, former = _Made.of(after), _Made.of(decided)
@@ -222,6 +223,7 @@ def associate_and_solve(
             break
         earlier.append(former)
     del after
+    assert converged is not None
     estimate = replace(graph.finish(converged, config.estimate), tree=decided.tree)
     as_seen = a.shapes(decided.problem, decided.tree, a.poses(estimate))  # from the last path
     progress("solve", 1.0)
@@ -233,21 +235,28 @@ FLIPS = 1e-4
 
 
 class _Made(NamedTuple):
-    """What a decision made: names (T,) of the trees, which of them are forked, and the tree (N,) of each detection."""
+    """What a decision made: which trees (T,) are forked, and the tree (N,) of each detection."""
 
-    ids: NDArray[np.int64]
     forked: NDArray[np.bool_]
     tree: NDArray[np.int64]
 
     @staticmethod
     def of(decided: Decided) -> _Made:
-        return _Made(decided.problem.names(), decided.shapes.forked, decided.tree)
+        return _Made(decided.shapes.forked, decided.tree)
 
     def like(self, other: _Made) -> bool:
-        """The same trees, made of the same detections."""
-        if not (np.array_equal(self.ids, other.ids) and np.array_equal(self.forked, other.forked)):
+        """The same trees, made of the same detections, whatever they are called: a tree whose first track goes to another takes a new name."""
+        if len(self.forked) != len(other.forked):
             return False
-        return int((self.tree != other.tree).sum()) <= FLIPS * len(self.tree)
+        pairs, count = np.unique(np.stack([self.tree, other.tree]), axis=1, return_counts=True)
+        pairs, count = pairs[:, np.argsort(-count, kind="stable")], np.sort(count)[::-1]
+        # Each tree and the one that has most of its detections; those are one where each is the other's.
+        mine, theirs = (np.unique(side, return_index=True)[1] for side in pairs)
+        same = np.intersect1d(mine, theirs)
+        trees = pairs[:, same][:, (pairs[:, same] >= 0).all(axis=0)]
+        if not np.array_equal(self.forked[trees[0]], other.forked[trees[1]]):
+            return False
+        return int(count.sum() - count[same].sum()) <= FLIPS * len(self.tree)
 
 
 LAST_ROUNDS = 8

@@ -76,6 +76,8 @@ ANYWHERE = Prior(np.zeros(3), np.zeros((2, 2)), 1e12)
 """Nothing is known of the place beforehand."""
 SLICE = 8_000
 """Pairs of trees that are tried at once while tracking: some ten milliseconds."""
+MOST_ANCHORS = 12
+"""Pairs of landmarks that a search begins with."""
 FEWER = 40
 """Placements that are weighed with their full covariance while tracking; those beyond count as rivals all the same."""
 
@@ -166,16 +168,15 @@ def _anchors(marks: Landmarks, index: MapIndex, config: PlacesConfig) -> list[tu
     both = q[a] * q[b]
     # Long pairs hold the heading; many candidates cost time.
     value = np.log(np.maximum(both, 1e-9)) + 0.1 * np.log(length + 1) - 0.08 * np.log(high - low + 1.0)
-    value[~usable] = -np.inf
-    out: list[tuple[int, int, float, int, int]] = []
+    best = [k for k in np.argsort(-value).tolist() if usable[k]]
+    chosen: dict[int, None] = {}  # in the order in which they were chosen
     busy = np.zeros(n, np.int64)
     for limit in (1, 2, 4):
-        for k in np.argsort(-value):
-            if not np.isfinite(value[k]):
+        for k in best:
+            if len(chosen) == MOST_ANCHORS:
                 break
-            i, j = int(a[k]), int(b[k])
-            if busy[i] < limit and busy[j] < limit and not any(o[:2] == (i, j) for o in out):
-                busy[i] += 1
-                busy[j] += 1
-                out.append((i, j, float(both[k]), int(low[k]), int(high[k])))
-    return out[:12]
+            if k not in chosen and max(busy[a[k]], busy[b[k]]) < limit:
+                busy[a[k]] += 1
+                busy[b[k]] += 1
+                chosen[k] = None
+    return [(int(a[k]), int(b[k]), float(both[k]), int(low[k]), int(high[k])) for k in chosen]

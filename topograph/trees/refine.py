@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from topograph.geometry import Array
 from topograph.trees.loops import TrackTable
 from topograph.trees.robust import weighted_median
 from topograph.trees.tracks import TreesConfig
@@ -25,7 +26,7 @@ def refine(
     than `config.merge` (a thick trunk's pieces: than its radius), become one, but for a post beside a tree. Rare tracks join a tree when they fit and are trees of their own otherwise.
     """
     place, sigma, hits = tracks.place, tracks.sigma, tracks.hits
-    tree = _leave(tracks, tree.copy(), config, max(patience, config.merge))
+    tree = _leave(tracks, tree.copy(), config, patience)
     for _ in range(4):
         ids, index = np.unique(tree, return_inverse=True)
         w = hits / np.maximum(sigma, config.floor) ** 2
@@ -40,9 +41,7 @@ def refine(
         apart = np.linalg.norm(centre[a] - centre[b], axis=1)
         d = np.minimum(apart, np.linalg.norm(foot[a] - foot[b], axis=1))
         variance = spread[a] ** 2 + spread[b] ** 2 + 2 * config.floor**2
-        fits = (d < config.merge + 0.4 * np.maximum(np.maximum(width[a], width[b]) - 0.2, 0.0)) | (
-            d**2 < 0.5 * config.gate * variance
-        )
+        fits = (d < _near(np.maximum(width[a], width[b]), config)) | (d**2 < 0.5 * config.gate * variance)
         fits &= ~((post[a] * post[b] < 0) & (np.minimum(abs(post[a]), abs(post[b])) > TOLD) & (apart > NOT_ONE))
         if not fits.any():
             break
@@ -57,6 +56,11 @@ def refine(
     return np.asarray(np.unique(tree, return_inverse=True)[1])
 
 
+def _near(width: Array, config: TreesConfig) -> Array:
+    """Distance, m, within which pieces of trunks of this `width` are of one."""
+    return np.asarray(config.merge + 0.4 * np.maximum(width - 0.2, 0.0))
+
+
 def _leave(tracks: TrackTable, tree: NDArray[np.int64], config: TreesConfig, patience: float) -> NDArray[np.int64]:
     fresh = int(tree.max(initial=0)) + 1
     order = np.argsort(tree, kind="stable")
@@ -69,6 +73,8 @@ def _leave(tracks: TrackTable, tree: NDArray[np.int64], config: TreesConfig, pat
             centre = np.array([weighted_median(at[:, k], tracks.hits[group]) for k in range(2)])
             d = np.minimum(d, np.linalg.norm(at - centre, axis=1))
         bound = np.sqrt(config.gate * (tracks.sigma[group] ** 2 + 2 * config.floor**2))
+        # What would be joined again does not leave: else it went to and fro from round to round.
+        bound = np.maximum(bound, _near(max(float(tracks.width[group] @ tracks.hits[group]) / tracks.hits[group].sum(), 0.0), config))
         for g in group[d > np.maximum(bound, patience)]:
             tree[g] = fresh
             fresh += 1

@@ -396,6 +396,9 @@ def _stated_lean_var(d: Detections, rows: NDArray[np.int64]) -> Array:
 
 def _widen(cov: Array, rows: NDArray[np.int64], change: Array) -> None:
     """Add `change` (K,) to the horizontal variances of rows of `cov`; a quarter of the least variance stays."""
-    change = np.maximum(change, -0.75 * np.linalg.eigvalsh(cov[rows])[:, 0])
+    C, change = cov[rows], np.array(change)
+    # The least variance is no less than four determinants over the square of the trace; only where that does not settle it, it is needed.
+    near = np.flatnonzero(change * np.trace(C, axis1=1, axis2=2) ** 2 < -3.0 * np.linalg.det(C))
+    change[near] = np.maximum(change[near], -0.75 * np.linalg.eigvalsh(C[near])[:, 0])
     cov[rows, 0, 0] += change
     cov[rows, 1, 1] += change

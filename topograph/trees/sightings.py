@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from topograph.geometry import Array, inverse, transform
+from topograph.geometry import Array, inverse, inverse_cov, transform
 from topograph.motion import Motion
 from topograph.trees.detections import Detections
 
@@ -81,7 +81,7 @@ class AtKeyframes:
             p[rows] = transform(T, detections.p[rows])
             moved[rows] = (transform(then, detections.p[rows]) - p[rows]) / (DELAY_NS * 1e-9)
             R = T[:, :3, :3]
-            information[rows] = np.linalg.inv(R @ detections.cov[rows] @ np.swapaxes(R, 1, 2))
+            information[rows] = inverse_cov(R @ detections.cov[rows] @ np.swapaxes(R, 1, 2))
             information[rows] *= believed[rows, None, None]
         return AtKeyframes(keyframe[detections.scan], p, information, moved)
 
@@ -105,7 +105,7 @@ class AtKeyframes:
         information = self.information[rows]
         total = np.add.reduceat(information, first)
         weighted = np.add.reduceat((information @ self.p[rows][:, :, None])[..., 0], first)
-        cov = np.linalg.inv(total)
+        cov = inverse_cov(total)
         mean = (cov @ weighted[..., None])[..., 0]
         effective = 1 + independent * (count - 1)
         late = np.add.reduceat(self.late[rows], first) / count[:, None]

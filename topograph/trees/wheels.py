@@ -7,7 +7,6 @@ their noise, the way that they tell stands in, with its deviation. The rule is `
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,19 +38,31 @@ def with_trunks_way(motion: Motion, d: Detections, fix_ns: Stamps) -> Motion:
     """
     if not motion.wheels or len(d) == 0 or len(d.stamps_ns) < 3 * LEGS:
         return motion
-    ns, legs = _legs(motion, d)
+    odom_T_robot = motion.at(d.stamps_ns)
+    scans_ns = np.column_stack([d.stamps_ns[:-1], d.stamps_ns[1:]])
+    ns, legs = _legs(odom_T_robot, d, _with_neighbours(~_near(fix_ns, scans_ns), d.stamps_ns))
     if len(legs) < LEGS:
         return motion
     slipping = _slipping(ns, legs) & ~_near(fix_ns, ns)
-    driven = np.hypot(legs[:, 2], legs[:, 3])
+    driven = np.linalg.norm(np.diff(odom_T_robot[:, :2, 3], axis=0), axis=1)
     if not slipping.any() or slipping.sum() > MOST * max(int((driven > 0.01).sum()), 1):
         return motion
     return _corrected(motion, ns, legs, slipping)
 
 
-def _legs(motion: Motion, d: Detections) -> tuple[NDArray[np.int64], Array]:
-    """From and to (L, 2), ns, and (L, 5): what the trunks add to the leg (x, y, m, in the robot's frame), its way (x, y, m), their sigma."""
-    odom_T_robot = motion.at(d.stamps_ns)
+def _with_neighbours(asked: NDArray[np.bool_], scans_ns: Stamps) -> NDArray[np.bool_]:
+    """Legs (S-1,) between scans that some window with an `asked` one (S-1,) in it has in it too."""
+    at = scans_ns[:-1][asked]
+    if not len(at):
+        return np.zeros(len(asked), bool)
+    window = int(LONGEST_S * 1e9)
+    first = np.searchsorted(at, scans_ns[:-1] - window)
+    return np.asarray(np.searchsorted(at, scans_ns[:-1] + window, "right") > first)
+
+
+def _legs(odom_T_robot: Array, d: Detections, asked: NDArray[np.bool_]) -> tuple[NDArray[np.int64], Array]:
+    """From and to (L, 2), ns, of the legs between scans that are `asked` for (S-1,), and (L, 5): what the trunks add to the leg (x, y, m, in
+    the robot's frame), its way (x, y, m), their sigma."""
     up = planar(odom_T_robot[:, 0, 3], odom_T_robot[:, 1, 3], yaw_of(odom_T_robot))
     up[:, 2, 3] = odom_T_robot[:, 2, 3]
     flat = transform((inverse(up) @ odom_T_robot)[d.scan], d.p)[:, :2]
@@ -61,7 +72,8 @@ def _legs(motion: Motion, d: Detections) -> tuple[NDArray[np.int64], Array]:
     ends = np.searchsorted(d.scan[rows], np.arange(len(d.stamps_ns) + 1))
     yaw = yaw_of(odom_T_robot)
     spans, legs = [], []
-    for a, b in pairwise(range(len(d.stamps_ns))):
+    for a in np.flatnonzero(asked).tolist():
+        b = a + 1
         if not 0 < d.stamps_ns[b] - d.stamps_ns[a] < GAP_NS:
             continue
         last, now = (flat[rows[ends[k] : ends[k + 1]]] for k in (a, b))

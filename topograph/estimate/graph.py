@@ -8,11 +8,12 @@ whose linear system also gives the covariances. Odometry and IMU are never robus
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
@@ -47,6 +48,13 @@ QUICK_HEIGHT = 0.3
 free, the height takes up what the range is off by, in steps of metres that Gauss-Newton overshoots."""
 
 
+class Moving(NamedTuple):
+    """What a solve leaves to the next one of the same run with other trees: preintegrated samples, and GTSAM's values with velocities and biases."""
+
+    inert: Inertia | None
+    values: Any
+
+
 @dataclass(frozen=True, slots=True)
 class Converged:
     """A solve before its last, exact steps: `estimate` has path and trees, and no covariances yet.
@@ -54,14 +62,13 @@ class Converged:
     Attributes:
         problem: with the sightings that were used.
         last: losses and noise of the last pass.
-        values: GTSAM's.
+        moving: with all of GTSAM's values.
         began: of `time.perf_counter`.
     """
 
     problem: Problem
     last: Pass
-    inert: Inertia | None
-    values: Any
+    moving: Moving
     estimate: Estimate
     began: float
 
@@ -101,8 +108,8 @@ def quick(problem: Problem, config: EstimateConfig, *, patient: bool = False) ->
 
 
 @_determined()
-def converge(problem: Problem, config: EstimateConfig, former: Converged | None = None) -> Converged:
-    """The robust passes of `solve`; from `former`, of the same run with other trees, come inertia, velocities and biases. Raises as it does."""
+def converge(problem: Problem, config: EstimateConfig, former: Moving | None = None) -> Converged:
+    """The robust passes of `solve`; it begins where `former` was. Raises as it does."""
     began = time.perf_counter()
     inert = former.inert if former is not None else inertia(problem) if config.use_imu else None
     problem, values = _begun(problem, config, config.most_sightings, inert)
@@ -125,17 +132,18 @@ def converge(problem: Problem, config: EstimateConfig, former: Converged | None 
         last = replace(last, trunk_scale=less[0], fix_scale=less[1], alike=scales[2])
         values = optimised(graph_of(problem, last, config, inert, values), values, config.iterations, MINIMUM)
     estimate = _estimate(problem, config, values, last, None, time.perf_counter() - began)
-    return Converged(problem, last, inert, values, estimate, began)
+    return Converged(problem, last, Moving(inert, values), estimate, began)
 
 
 @_determined()
 def finish(c: Converged, config: EstimateConfig) -> Estimate:
     """The exact steps of `solve`, covariances, and the tests of what is taken as given. Raises as it does."""
-    values, linear = with_big_stack(lambda: _polish(c.problem, c.last, config, c.inert, c.values))
+    inert = c.moving.inert
+    values, linear = with_big_stack(lambda: _polish(c.problem, c.last, config, inert, c.moving.values))
     out = _estimate(c.problem, config, values, c.last, linear, 0.0)
     del linear  # as large as the graph: the tests make one of their own
     try:
-        offsets = with_big_stack(lambda: tested(c.problem, c.last, config, c.inert, values, out.map_T_robot, out.trees))
+        offsets = with_big_stack(lambda: tested(c.problem, c.last, config, inert, values, out.map_T_robot, out.trees))
     except (RuntimeError, IndexError, np.linalg.LinAlgError):  # the estimate stands without them
         _log.warning("clocks and mountings could not be tested", exc_info=True)
         offsets = ()
@@ -258,8 +266,9 @@ def _learned_scales(problem: Problem, values: Any, p: Pass) -> tuple[float, floa
     return trunk, fix, alike
 
 
-POLISHED = 2e-5
-"""Root mean square of a last step, m and rad: steps shrink, and a hundredth of this is what is left."""
+POLISHED, UNDECIDED = 2e-5, 0.01
+"""Root mean square of a last step, m: steps shrink, and a hundredth of this is what is left; and the share of poses and trees that it leaves out: a
+tree whose sightings contradict each other may creep on for many steps, and moves nothing else."""
 
 
 def _polish(problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | None, values: Any) -> tuple[Any, Any]:
@@ -270,15 +279,17 @@ def _polish(problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | 
     keys_x, keys_l = (X + s.keyframe).tolist(), (L + problem.names()[s.tree]).tolist()
     cov = p.trunk_scale**2 * s.cov
     linear = None
+    path, trees = path_of(problem, values), trees_of(problem, values)
     for _ in range(8):
         linear = rest.linearize(values)
         if len(s):
-            path, trees = path_of(problem, values), trees_of(problem, values)
             factors.trunk_linear(linear, keys_x, keys_l, path[s.keyframe], trees[s.tree], s.p, cov, p.trunk)
         ordering = ordering or ordering_of(linear, values.size())
-        step = linear.optimize(ordering)
-        values = values.retract(step)
-        if step.norm() < POLISHED * np.sqrt(values.size()):
+        before = np.concatenate([path[:, :3, 3], trees])
+        values = values.retract(linear.optimize(ordering))
+        path, trees = path_of(problem, values), trees_of(problem, values)
+        moved = np.sum((np.concatenate([path[:, :3, 3], trees]) - before) ** 2, axis=1)
+        if np.sort(moved)[: math.ceil((1.0 - UNDECIDED) * len(moved))].mean() < POLISHED**2:
             break
     return values, linear
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -30,6 +31,11 @@ UNKNOWN_TILT = 0.12
 """Deviation of roll and pitch on the slopes of orchards, rad, where no IMU tells them."""
 HEADING_FLOOR = 0.004
 """Least deviation of a heading from trees for learning the gyro's bias, rad: its errors last over many scans."""
+
+REMEMBERED = 1000
+"""Recorded detections whose middle height is that of all: of some dozens of scans."""
+AXIS_SIGMA = 0.05
+"""Of the axis that one scan states, rad."""
 
 log = logging.getLogger(__name__)
 
@@ -148,10 +154,20 @@ class GraphMethod:
         self._seen_at = 0.0
         self._ground = GROUND_SIGMA**2
         self._shared = 0.0
+        self._above: deque[float] = deque(maxlen=REMEMBERED)
 
-    def _begin(self, trunks: Trunks) -> Engine:
-        """The index is built at the height at which this front end states its trunks."""
-        above = trunks.height[np.isfinite(trunks.height)]
+    def _stated(self, trunks: Trunks) -> Array:
+        """Heights (N,) above ground at which a scan's trunks are stated, m. Recorded detections lie at one height, which each scan says from the
+        ground that the robot stands on, as if it went on like that: all scans together say it better.
+        """
+        if len(trunks.kinds):  # our own front end measures each
+            return trunks.height
+        self._above.extend(trunks.height[np.isfinite(trunks.height)].tolist())
+        return np.full(len(trunks), np.median(self._above) if self._above else np.nan)
+
+    def _begin(self, heights: Array) -> Engine:
+        """The index is built at the height (of `heights`, (N,)) at which this front end states its trunks."""
+        above = heights[np.isfinite(heights)]
         self.height = float(np.median(above)) if len(above) else 0.0
         t = self.topo
         xy = t.p[:, :2] + t.axis[:, :2] * (self.height / np.maximum(t.axis[:, 2:], 0.3))
@@ -167,7 +183,7 @@ class GraphMethod:
         """Track from a pose (4, 4) that somebody else is sure of, with the covariance (3, 3) of its x, y and yaw; `trunks` say at
         which height this front end states them.
         """
-        self.engine = self._begin(trunks)
+        self.engine = self._begin(self._stated(trunks))
         self.engine.begin_at(np.array([*map_T_robot[:2, 3], yaw_of(map_T_robot)]), cov)
         self._tilt[:] = map_T_robot[2, 3], 0.0, 0.0
         tilt = 0.02**2
@@ -175,15 +191,19 @@ class GraphMethod:
 
     def step(self, trunks: Trunks, leg: Leg) -> Report:
         """One scan further."""
+        heights = self._stated(trunks)
         if self.engine is None:
             if not len(trunks):
                 return Report(
                     stamp_ns=trunks.stamp_ns, state="searching", fix=None, hypotheses=0, risk=1.0, places=np.zeros((0, 3)),
                     trees=np.zeros(0, np.int64), pairs=np.zeros((0, 2), np.int64), along=np.nan, across=np.nan,
                 )  # fmt: skip
-            self.engine = self._begin(trunks)
+            self.engine = self._begin(heights)
         if len(trunks) and leg.seconds > 0 and np.array_equal(trunks.p, self._last_p):
-            trunks = trunks.select(np.zeros(len(trunks), bool))  # a driver that repeats itself: nothing was seen
+            trunks, heights = (
+                trunks.select(np.zeros(len(trunks), bool)),
+                heights[:0],
+            )  # a driver that repeats itself: nothing was seen
         else:
             self._last_p = trunks.p
         if not leg.level:
@@ -194,7 +214,7 @@ class GraphMethod:
         if len(flat):
             self._seen_at = float(np.median(np.abs(flat[:, 2])))
         self.move = move_of(watched, self.config)
-        self.sweep, rows = sweep_of(trunks, level_T_robot, leg, self.config)
+        self.sweep, rows = sweep_of(trunks, level_T_robot, leg, self.config, np.nan_to_num(heights - self.height))
         self.contradicted = watched is not leg
         belief = self.engine.step(
             move_of(leg, self.config),
@@ -205,7 +225,7 @@ class GraphMethod:
         )
         self.sweep_pairs = belief.pairs
         belief = replace(belief, pairs=np.stack([rows[belief.pairs[:, 0]], belief.pairs[:, 1]], axis=1))
-        self._rise(leg, belief, trunks, flat)
+        self._rise(leg, belief, heights, flat)
         fix = self._fix(trunks.stamp_ns, belief, leg) if belief.pose is not None else None
         flat_cov = belief.cov[:2, :2]
         if fix is not None:  # all that is open of the place in the map; where the map lies on Earth is another matter
@@ -237,8 +257,8 @@ class GraphMethod:
         x, y, z = self._vertical / np.linalg.norm(self._vertical)
         return replace(leg, roll=float(np.arctan2(y, z)), pitch=float(-np.arcsin(x)))
 
-    def _rise(self, leg: Leg, belief: Belief, trunks: Trunks, flat: Array) -> None:
-        """Height, and what gravity leaves open of roll and pitch, from the heights at which known trees are seen."""
+    def _rise(self, leg: Leg, belief: Belief, heights: Array, flat: Array) -> None:
+        """Height, and what gravity leaves open of roll and pitch, from where known trees are seen at `heights` (N,) above their feet."""
         x, P = self._tilt, self._tilt_cov
         if belief.pose is None:
             x[:] = 0.0
@@ -254,10 +274,10 @@ class GraphMethod:
             self._shared = SHARED**2 * float(self.engine.index.var[belief.pairs[:, 1]].mean())
         for i, t in belief.pairs:
             self._ground += 0.02 * (GROUND_SIGMA**2 + _known(self.topo.cov[t, 2, 2]) - self._ground)
-            ground = self.topo.p[t, 2] + (trunks.height[i] if np.isfinite(trunks.height[i]) else self.height)
+            place = self.topo.p[t, 2] + (heights[i] if np.isfinite(heights[i]) else self.height)
             H = np.array([1.0, flat[i, 1], -flat[i, 0]])
             S = H @ P @ H + 0.12**2 + (0.01 * np.hypot(*flat[i, :2])) ** 2
-            r = ground - flat[i, 2] - H @ x
+            r = place - flat[i, 2] - H @ x
             if r * r < 12.0 * S:
                 K = P @ H / S
                 x += K * r
@@ -317,17 +337,23 @@ def move_of(leg: Leg, config: LocalizeConfig) -> Move:
     return Move(leg.step, np.diag([along**2, across**2, yaw**2 + 1e-8]), leg.distance)
 
 
-def sweep_of(trunks: Trunks, level_T_robot: Array, leg: Leg, config: LocalizeConfig) -> tuple[Sweep, NDArray[np.int64]]:
-    """A scan's trunks seen from above, in the levelled robot frame, and their rows."""
+def sweep_of(
+    trunks: Trunks, level_T_robot: Array, leg: Leg, config: LocalizeConfig, above: Array
+) -> tuple[Sweep, NDArray[np.int64]]:
+    """A scan's trunks seen from above, in the levelled robot frame, and their rows. They are stated `above` (N,) the height at which the map's
+    trees are compared, m, and brought down to it along their own axes.
+    """
     if not len(trunks):
         return Sweep(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0)), np.zeros(0, np.int64)
     R = level_T_robot[:3, :3]
-    p = trunks.p @ R.T
+    axis = trunks.axis @ R.T
+    p = trunks.p @ R.T - (above / np.maximum(axis[:, 2], 0.3))[:, None] * axis
     across = np.eye(3) - trunks.axis[:, :, None] * trunks.axis[:, None, :]  # along itself a trunk may be anywhere
     sound = np.isfinite(trunks.cov).all(axis=(1, 2))
     sound &= np.asarray(np.diagonal(trunks.cov, axis1=1, axis2=2) >= 0).all(axis=1)
     cov = across @ np.where(np.reshape(sound, (-1, 1, 1)), trunks.cov, 0.0) @ across
     flat = np.array((R @ cov @ R.T)[:, :2, :2])
+    flat[:, [0, 1], [0, 1]] += ((AXIS_SIGMA * above) ** 2)[:, None]
     reach = np.hypot(p[:, 0], p[:, 1])
     least = (0.02 + 0.001 * reach) ** 2
     if not leg.level:

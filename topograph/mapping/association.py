@@ -209,10 +209,11 @@ def associate_and_solve(
     del a.seen  # as large as the detections, and from here on each decision makes its own
     after = a.decide(estimate)
     earlier: list[_Made] = []
-    converged: graph.Converged | None = None
+    moving: graph.Moving | None = None
     for n in range(LAST_ROUNDS if config.trees.reassociate else 1):
         decided = after
-        converged = graph.converge(decided.problem, config.estimate, converged)
+        converged = graph.converge(decided.problem, config.estimate, moving)
+        moving = converged.moving
         progress("solve", (n + 1) / LAST_ROUNDS)
         after = a.decide(converged.estimate)
         made, former = _Made.of(after), _Made.of(decided)
@@ -223,7 +224,6 @@ def associate_and_solve(
             break
         earlier.append(former)
     del after
-    assert converged is not None
     estimate = replace(graph.finish(converged, config.estimate), tree=decided.tree)
     as_seen = a.shapes(decided.problem, decided.tree, a.poses(estimate))  # from the last path
     progress("solve", 1.0)

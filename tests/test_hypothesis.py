@@ -57,10 +57,10 @@ def test_a_sighting_in_the_plane(
 class World:
     """A drive in a circle among trees, with errors of the sizes that are stated."""
 
-    def __init__(self, seed: int, bias: float = 0.0) -> None:
+    def __init__(self, seed: int, bias: float = 0.0, map_sigma: float = MAP_SIGMA) -> None:
         self.rng = np.random.default_rng(seed)
         self.true = self.rng.uniform(-18, 18, (60, 2))
-        self.mapped = self.true + self.rng.normal(0, MAP_SIGMA, (60, 2))
+        self.mapped = self.true + self.rng.normal(0, map_sigma, (60, 2))
         self.pose = np.array([6.0, 0.0, np.pi / 2])
         self.bias = bias
         self.cov = np.diag([STEP**2, STEP**2, TURN**2])
@@ -113,6 +113,21 @@ def test_what_is_stated_is_true_and_what_each_measurement_is_worth() -> None:
     assert both[1] < bearings[1]
     assert both[1] < ranges[1]
     assert both[1] < 0.03
+
+
+@pytest.mark.parametrize(("map_sigma", "low", "high"), [(0.005, 0.2, 0.5), (0.03, 0.7, 1.4), (0.06, 1.8, 4.5)])
+def test_how_well_the_map_is_known_is_learnt(map_sigma: float, low: float, high: float) -> None:
+    """Trees that lie better than is taken for granted, as well, and worse: the covariance follows, with caution."""
+    config = LocalizeConfig(trunk_sigma=0.0)
+    scales = []
+    for seed in range(12):
+        w = World(seed, map_sigma=map_sigma)
+        h = w.begin(config)
+        assert h.scale == 1.0
+        for _ in range(70):
+            h.step(*w.step())
+        scales.append(h.scale)
+    assert low < np.median(scales) < high
 
 
 def test_the_lag_costs_nothing() -> None:

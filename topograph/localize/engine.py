@@ -407,7 +407,7 @@ class Engine:
         if f is not None:
             pose, cov = f.mean[:3].copy(), f.cov[:3, :3].copy()
             if self.graph is not None:
-                pose, cov = self.graph.pose.copy(), self.graph.cov.copy()
+                pose, cov = self.graph.pose.copy(), self.graph.scale * self.graph.cov
             return Belief(
                 state=self.state,
                 pose=pose,

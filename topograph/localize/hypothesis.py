@@ -31,6 +31,12 @@ DRAGGED = 2.0
 nobody knows of, and what was learnt of the trees from scan to scan is wrong."""
 ANEW_YAW = 0.03
 """Of the heading then, rad."""
+TELLS = 6
+"""Sightings of a tree before how far it was moved tells how well the map knows it."""
+TAKEN, PLACE = 8.0, (0.015, 0.1)
+"""Trees' worth of what is taken beforehand for the map's own deviation (`map_sigma`), and the least and the most that it can be found to be, m."""
+OUTLIER = 9.0
+"""Squared deviations beyond which a tree says no more of it: it may be another one."""
 LEAST = 1e-10
 """Added to the variances of a step: a robot that stands has none."""
 
@@ -53,6 +59,9 @@ class Hypothesis:
         prior = gtsam.PriorFactorPose2(_X(0), gtsam.Pose2(*pose), gtsam.noiseModel.Gaussian.Covariance(own))
         self._factors: list[Any] = [prior]
         self._last_seen: dict[int, int] = {}
+        self._noise: dict[int, float] = {}  # of its sightings together, 1/m²
+        self._counted: dict[int, int] = {}
+        self._gone = np.zeros(2)
         self.dragged = 0.0
         self.pose, self.cov = np.asarray(pose, float).copy(), np.asarray(cov, float).copy()
 
@@ -74,6 +83,8 @@ class Hypothesis:
                     gtsam.PriorFactorPoint2(_L(t), self.trees[t], gtsam.noiseModel.Isotropic.Sigma(2, sigma))
                 )
             self._last_seen[t] = self._k
+            self._counted[t] = self._counted.get(t, 0) + 1
+            self._noise[t] = self._noise.get(t, 0.0) + 2.0 / float(np.trace(sweep.cov[i] + side))
             self._factors.append(
                 sighting_2d(_X(self._k), _L(t), sweep.p[i], sweep.cov[i] + side, HUBER, self.config.measure)
             )
@@ -114,6 +125,30 @@ class Hypothesis:
         at = np.array([self._values.atPoint2(_L(t)) for t in seen.tolist()])
         return float(np.median(np.linalg.norm(at - self.trees[seen], axis=1) / np.sqrt(self.var[seen])))
 
+    def _told(self, trees: list[int]) -> Array:
+        """What `trees` tell of the map's own deviation: the sum over them of its square, and how many there are.
+
+        A tree of prior variance v that n sightings of variance r saw moves by v / (v + r/n) of what it is off and they err.
+        """
+        t = np.array([k for k in trees if self._counted[k] >= TELLS], np.int64)
+        if not len(t):
+            return np.zeros(2)
+        at = np.array([self._values.atPoint2(_L(k)) for k in t.tolist()])
+        v, r = self.var[t], 1.0 / np.array([self._noise[k] for k in t.tolist()])
+        moved = np.minimum(0.5 * np.sum((at - self.trees[t]) ** 2, axis=1), OUTLIER * v)
+        own = v - self.config.map_sigma**2
+        return np.array([float(np.sum(moved * ((v + r) / v) ** 2 - r - own)), len(t)])
+
+    @property
+    def scale(self) -> float:
+        """Of the covariance: what is found of the map's own deviation against what was taken for it (a variance component, Förstner 1979)."""
+        total, n = self._gone + self._told(list(self._last_seen))
+        taken = self.config.map_sigma**2
+        free = 2.0 * n / max(2.0 * n - 3.0, 1.0)  # the pose takes up what they have in common
+        found = float(np.clip((TAKEN * taken + free * total) / (TAKEN + n), PLACE[0] ** 2, PLACE[1] ** 2))
+        own = float(np.mean(self.var[list(self._last_seen)])) - taken if self._last_seen else 0.0
+        return (own + found) / (own + taken)
+
     def _marginalise(self) -> None:
         """The oldest poses, and trees that only they saw, become a linear factor on the rest."""
         old = {_X(k) for k in self._poses[:OLDEST]}
@@ -124,6 +159,7 @@ class Hypothesis:
             for t, k in self._last_seen.items()
             if k < first and float(np.hypot(*(self.trees[t] - self.pose[:2]))) > away
         ]
+        self._gone += self._told(gone)
         old |= {_L(t) for t in gone}
         mine = [f for f in self._factors if not old.isdisjoint(f.keys())]
         touched = gtsam.NonlinearFactorGraph()
@@ -141,7 +177,7 @@ class Hypothesis:
         for key in old:
             self._values.erase(key)
         for t in gone:
-            del self._last_seen[t]
+            del self._last_seen[t], self._counted[t], self._noise[t]
         del self._poses[:OLDEST]
 
 

@@ -49,7 +49,7 @@ def problem(
         stamps_ns=stamps,
         scan=k,
         p=p,
-        cov=cov,
+        cov=cov.astype(np.float32),
         axis=np.tile([0.0, 0.0, 1.0], (len(k), 1)),
         height=nothing,
         diameter=nothing + 0.2,
@@ -150,7 +150,7 @@ def test_rungs_of_the_ladder(rule, expected: float) -> None:
     cov = np.tile(np.eye(3) * 1e-4, (3, 1, 1))
     cov[0] *= 4.0
     cov[2] /= 3.0
-    d = replace(p.detections, p=z, cov=cov)
+    d = replace(p.detections, p=z, cov=cov.astype(np.float32))
     out = average.solve(replace(p, detections=d), AverageConfig(least=1, rule=rule))
     np.testing.assert_allclose(out.trees[0, 0], expected, atol=1e-6)
 

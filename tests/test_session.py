@@ -25,7 +25,7 @@ def drawn(seed: int, stamp_ns: int) -> Trunks:
         p=rng.normal(size=(n, 3)),
         axis=rng.normal(size=(n, 3)),
         diameter=rng.random(n),
-        cov=rng.random((n, 3, 3)),
+        cov=rng.random((n, 3, 3), dtype=np.float32).astype(float),  # kept in single precision
         height=np.full(n, np.nan),
         score=rng.normal(size=n),
         clouds=tuple(rng.normal(size=(int(k), 3)).astype(np.float32) for k in rng.integers(0, 4, n)) if told[0] else (),

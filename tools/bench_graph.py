@@ -39,7 +39,7 @@ def problem(n: int) -> Problem:
     which, frame = np.asarray(j).ravel(), np.repeat(k, SEEN)
     size = len(which)
     p = transform(inverse(poses)[frame], trees[which]) + SIGMA * rng.normal(size=(size, 3))
-    cov = np.tile(SIGMA**2 * np.eye(3), (size, 1, 1))
+    cov = np.tile(SIGMA**2 * np.eye(3, dtype=np.float32), (size, 1, 1))
     stamps = k * 500_000_000
     step = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))])
     turned = np.concatenate([[0.0], np.cumsum(np.pi * (np.diff(line) > 0))])

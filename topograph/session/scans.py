@@ -25,7 +25,7 @@ class Scans(Sequence[Trunks]):
 
     Attributes:
         stamps_ns: (S,) as they came; `frames` of each; `ends` (S + 1,) rows where each begins.
-        p, axis, diameter, cov, height, score: (N, ...) as in `Trunks`.
+        p, axis, diameter, height, score: (N, ...) as in `Trunks`; `cov` too, in single precision: it is half of a trunk, and known to a digit.
         kinds: (N, 3), NaN where the source tells none; `measured` (N, 6), zeros; `stems` (N,), one.
         free: (S, SECTORS), zeros where a scan tells nothing, or (0, SECTORS) where none does; `eye` (S, 3).
         points: (M, 3) of all clouds; `cloud_ends` (N + 1,) where each begins.
@@ -38,7 +38,7 @@ class Scans(Sequence[Trunks]):
     p: Array
     axis: Array
     diameter: Array
-    cov: Array
+    cov: NDArray[np.float32]
     height: Array
     score: Array
     kinds: Array
@@ -80,7 +80,7 @@ class Scans(Sequence[Trunks]):
             p=self.p[a:b],
             axis=self.axis[a:b],
             diameter=self.diameter[a:b],
-            cov=self.cov[a:b],
+            cov=self.cov[a:b].astype(float),
             height=self.height[a:b],
             score=self.score[a:b],
             clouds=tuple(self.cloud(i) for i in range(a, b)) if clouds else (),
@@ -238,7 +238,7 @@ def _columns(trunks: Sequence[Trunks]) -> Scans:
         p=rows("p", 3),
         axis=rows("axis", 3),
         diameter=rows("diameter"),
-        cov=rows("cov", 3, 3),
+        cov=rows("cov", 3, 3, dtype=np.float32),
         height=rows("height"),
         score=rows("score"),
         kinds=rows("kinds", 3, missing=np.nan),

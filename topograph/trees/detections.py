@@ -38,7 +38,7 @@ class Detections:
     stamps_ns: Stamps
     scan: NDArray[np.int64]
     p: Array
-    cov: Array
+    cov: NDArray[np.float32]
     axis: Array
     height: Array
     diameter: Array

@@ -394,9 +394,9 @@ def _stated_lean_var(d: Detections, rows: NDArray[np.int64]) -> Array:
     return np.asarray(1.0 / (d.measured[rows, SLOPE_WEIGHT] + 1.0 / STATED_PRIOR**2))
 
 
-def _widen(cov: Array, rows: NDArray[np.int64], change: Array) -> None:
+def _widen(cov: NDArray[np.float32], rows: NDArray[np.int64], change: Array) -> None:
     """Add `change` (K,) to the horizontal variances of rows of `cov`; a quarter of the least variance stays."""
-    C, change = cov[rows], np.array(change)
+    C, change = cov[rows].astype(float), np.array(change)
     # The least variance is no less than four determinants over the square of the trace; only where that does not settle it, it is needed.
     near = np.flatnonzero(change * np.trace(C, axis1=1, axis2=2) ** 2 < -3.0 * np.linalg.det(C))
     change[near] = np.maximum(change[near], -0.75 * np.linalg.eigvalsh(C[near])[:, 0])

@@ -34,6 +34,26 @@ def test_bearing_basis_is_gtsams(d: np.ndarray) -> None:
         np.testing.assert_allclose(b, gtsam.Unit3(u).basis(), atol=1e-9)
 
 
+@given(
+    st.floats(-3.1, 3.1),
+    st.floats(-0.3, 0.3),
+    st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(-0.1, 0.1)),
+)
+def test_a_trunk_abeam_has_its_height_weighed_as_its_height(
+    bearing: float, height: float, off: tuple[float, float, float]
+) -> None:
+    """Whatever axis GTSAM's basis is built across: the error is that of the straight residual, where height is known ten times worse."""
+    seen = np.array([4.0 * np.cos(bearing), 4.0 * np.sin(bearing), height])
+    expected = seen + off
+    cov = np.diag([0.03, 0.03, 0.3]) ** 2
+    f = factors.trunks([1], [2], seen[None], cov[None], Kernel("none"), expected=expected[None])[0]
+    v = gtsam.Values()
+    v.insert(1, gtsam.Pose3())
+    v.insert(2, expected)
+    straight = 0.5 * np.array(off) @ np.linalg.solve(cov, off)
+    assert f.error(v) == pytest.approx(straight, rel=0.2, abs=0.2)
+
+
 @given(tangents, points, points)
 def test_trunk_residual_jacobians(xi: np.ndarray, tree: np.ndarray, z: np.ndarray) -> None:
     T = exp(xi)

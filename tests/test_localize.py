@@ -471,7 +471,7 @@ def test_live_door_gives_poses_and_reports() -> None:
 
 @pytest.mark.parametrize("first", [0.5, 1.1])
 def test_leaning_trees_are_compared_at_the_height_that_all_scans_say(first: float) -> None:
-    """Recorded detections at 0.8 m on trees that lean, whose height the first scan misjudges: the ground under the robot went on otherwise."""
+    """Recorded detections at 0.8 m on trees that lean, whose height some scans misjudge: the ground under the robot went on otherwise."""
     rng = np.random.default_rng(5)
     foot = rng.uniform(0, 40, (40, 2))
     axis = np.tile(np.array([0.25, 0.0, 1.0]) / np.hypot(0.25, 1.0), (40, 1))
@@ -481,7 +481,7 @@ def test_leaning_trees_are_compared_at_the_height_that_all_scans_say(first: floa
         x, stamp = np.array([12.0 + 0.4 * k, 20.0]), 10**18 + k * 500_000_000
         rows = np.flatnonzero(np.hypot(*(foot - x).T) < 12.0)
         seen = foot[rows] + [0.25 * 0.8, 0.0] - x + rng.normal(0, 0.01, (len(rows), 2))
-        height = first if k == 0 else 0.8
+        height = first if k == 0 else 0.8 + 0.5 * (k % 5 > 2)  # and two in five that follow
         trunks = replace(trunks_at(seen, stamp), axis=axis[rows], height=np.full(len(rows), height))
         heard = [imu_at(0.5 * k + t, 0.0) for t in (-0.4, -0.3, -0.2, -0.1, 0.0)]
         fix = localizer.update(trunks, [*heard, odometry_at(0.5 * k, 0.4 * k, 0.0, 0.0)])

@@ -8,7 +8,7 @@ import pytest
 from topograph.evaluate.metrics import match
 from topograph.geometry import from_xyz_rpy, inverse, transform
 from topograph.simulate.growth import _girth
-from topograph.trees import Detections, Shapes, TreesConfig, exists, feet, grounds, refine, shapes, tabulate
+from topograph.trees import Detections, Shapes, TrackTable, TreesConfig, exists, feet, grounds, refine, shapes, tabulate
 from topograph.trunks.fit import LEAN_SIGMA_PRIOR
 
 HEIGHT = 0.8
@@ -125,6 +125,26 @@ def test_stems_of_one_foot_are_one_tree(feet_apart: float, slopes: tuple[float, 
     tree = refine(table, np.arange(2), TreesConfig())
     assert len(np.unique(tree)) == trees
     assert len(np.unique(refine(table, tree, TreesConfig()))) == trees  # and it stays so
+
+
+@pytest.mark.parametrize("apart", [0.5, 0.6, 0.9])
+def test_pieces_of_a_thick_trunk_do_not_go_to_and_fro(apart: float) -> None:
+    """Many tracks of two faces of one trunk: what was joined by its width does not leave for its distance, only to be joined again."""
+    face = np.repeat([0, 1], (20, 16))
+    n = len(face)
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        at = np.column_stack([apart * face, 0.0 * face]) + rng.normal(0, 0.03, (n, 2))
+        table = TrackTable(
+            place=at, foot=at, width=np.full(n, 0.6), post=np.full(n, -3.0), sigma=rng.uniform(0.01, 0.03, n),
+            first=np.zeros(n), last=np.ones(n), hits=rng.integers(3, 400, n),
+        )  # fmt: skip
+        tree = refine(table, np.arange(n), TreesConfig())
+        trees = []
+        for _ in range(6):
+            tree = refine(table, tree, TreesConfig())
+            trees.append(len(np.unique(tree)))
+        assert set(trees[2:]) == {2 if apart > 0.7 else 1}
 
 
 def test_recorded_axes_that_disagree_widen_the_lean() -> None:

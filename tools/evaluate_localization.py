@@ -21,8 +21,9 @@ import numpy as np
 
 from topograph.bags import Trunks
 from topograph.localize import ThesisConfig, ThesisMethod
+from topograph.localize.belief import Belief
 from topograph.localize.config import LocalizeConfig
-from topograph.localize.engine import Belief, Engine
+from topograph.localize.engine import Engine
 from topograph.localize.submap import Move, Sweep
 from topograph.motion import Leg
 from topograph.places.index import MapIndex, build_index

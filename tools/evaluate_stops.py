@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,21 +44,33 @@ def main() -> None:
                 run(design, seed, rate, at_stops=name == "stops", lidar=a.lidar)
                 for seed in range(a.first, a.first + a.seeds)
             ]
-            trees, off, yaw = (np.concatenate([r[k] for r in rows]) for k in (0, 2, 3))
-            tree_nees = np.concatenate([r[1] for r in rows])
-            scans, lost = (sum(r[k] for r in rows) for k in (5, 6))
+            trees, tree_nees, off, yaw = (
+                np.concatenate([getattr(r, k) for r in rows]) for k in ("trees", "tree_nees", "off", "yaw")
+            )
+            scans, lost = sum(r.scans for r in rows), sum(r.lost for r in rows)
             print(
                 f"{design:<8} {name:<6}  {100 * trees.mean():6.2f} {np.nanmean(tree_nees):13.2f}   {scans:5d} {lost:4d} {int((off > 0.5).sum()):5d}   "
                 f"{100 * off.mean():8.2f} {100 * np.percentile(off, 99):8.2f} {np.degrees(yaw).mean():20.3f}         "
-                f"{' '.join(f'{np.nanmean(r[4]):.2f}' for r in rows)}",
+                f"{' '.join(f'{np.nanmean(r.nees):.2f}' for r in rows)}",
                 flush=True,
             )
 
 
-def run(
-    design: str, seed: int, rate: float, *, at_stops: bool, lidar: bool
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, int, int]:
-    """Errors of trees, m, their NEES; of poses, m and rad, their NEES; scans after the first pose, and how many of them have none."""
+class Result(NamedTuple):
+    """Of one orchard: errors of `trees`, m, and their NEES; of poses, `off` m and `yaw` rad, and their NEES; `scans` after the first pose, and how
+    many of them are `lost`."""
+
+    trees: np.ndarray
+    tree_nees: np.ndarray
+    off: np.ndarray
+    yaw: np.ndarray
+    nees: np.ndarray
+    scans: int
+    lost: int
+
+
+def run(design: str, seed: int, rate: float, *, at_stops: bool, lidar: bool) -> Result:
+    """Map the first run, localize the second."""
     with tempfile.TemporaryDirectory() as folder:
         bags = [Path(folder) / f"r{k}.bag" for k in (1, 2)]
         for k, bag in enumerate(bags):
@@ -73,7 +86,8 @@ def run(
         errors = localization_errors(replay.reports, truth, world_in_map(topo, truth))
         known = np.array([r.fix is not None for r in replay.reports])
         after = known[int(np.argmax(known)) :] if known.any() else known
-        return e, nees, np.hypot(*errors.xy.T), np.abs(errors.yaw), errors.nees, len(after), int((~after).sum())
+        off, yaw = np.hypot(*errors.xy.T), np.abs(errors.yaw)
+        return Result(e, nees, off, yaw, errors.nees, len(after), int((~after).sum()))
 
 
 def tree_misfit(topo: TopoMap, truth: Truth) -> tuple[np.ndarray, np.ndarray]:

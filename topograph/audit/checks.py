@@ -376,6 +376,10 @@ SEEN_ANEW = 12.0
 """Keyframes' worth of independent trees in a run."""
 
 
+TOO_NEAR, TWIN, TWOFOLD = 0.25, 0.3, 0.5
+"""Shares of the usual distance and of that to the third nearest below which a tree is one too many; the share of trees so near that the map is there twice."""
+
+
 def twice(xy: Array) -> float:
     """Share of trees (T, 2) that have another one nearer than a quarter of the usual distance; 0 where they are fewer than PAIRS pairs.
 
@@ -385,7 +389,7 @@ def twice(xy: Array) -> float:
     if len(xy) < 6:
         return 0.0
     distance = np.asarray(cKDTree(xy).query(xy, k=4)[0])
-    near = distance[:, 1] < 0.25 * np.median(distance[:, 1])
-    twofold = distance[:, 1] < 0.3 * distance[:, 3]
-    near |= twofold & (twofold.mean() > 0.5)
+    near = distance[:, 1] < TOO_NEAR * np.median(distance[:, 1])
+    twofold = distance[:, 1] < TWIN * distance[:, 3]
+    near |= twofold & (twofold.mean() > TWOFOLD)
     return float(near.mean()) if near.sum() >= 2 * PAIRS else 0.0

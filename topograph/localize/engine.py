@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from topograph.geometry import Array, inverse, planar
+from topograph.geometry import Array, inverse, planar, wrap
+from topograph.localize.belief import CONTRADICTED, Belief, against, held, likely, open_among
 from topograph.localize.config import LocalizeConfig
 from topograph.localize.filter import Filter
 from topograph.localize.filter_kernels import assign, in_view
@@ -32,46 +33,6 @@ DRAGGED_AGAIN = 5.0
 CROWD, FEW = 3.0, 0.3
 """Where more trees than this should be seen, and fewer than this share of them are, the pose is in doubt at once."""
 NO_PAIRS = np.zeros((0, 2), np.int64)
-LITTLE, COARSE, SEVERAL, ALIKE, ELSEWHERE, CONTRADICTED = REASONS = (
-    "too few trees were seen to tell places apart",
-    "trees are known too badly for how densely they stand",
-    "several places of the map fit",
-    "the planting is so regular that another one of its design would fit as well (if that cannot be, set localize.alike to 1e-9)",
-    "nothing on this map fits what was seen well enough",
-    "wheels or gyro contradict the trees for so long that nobody is believed",
-)
-SET_ASIDE = 1e-5
-"""Of the prior of another orchard of this design, what is left where somebody says that it cannot be (`ALIKE`)."""
-STATES = ("searching", "ambiguous", "tracking", "degraded", "lost")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Belief:
-    """What is believed after a scan.
-
-    Attributes:
-        state: one of `STATES`.
-        pose: (3,) x, y, yaw of the robot in the map when committed, else None; `cov` (3, 3) m², m rad, rad².
-        hypotheses: places that together hold 99 % of what is on the map; 1 when committed.
-        risk: chance that the pose (or the best place) is wrong.
-        places: (H, 3) the robot's poses of those hypotheses, most probable first, and `weights` (H,).
-        pairs: (K, 2) rows of the sweep's trunks and of the mapped trees that they are.
-        why: while nothing is committed, what stands against it: one of `REASONS`; else "".
-    """
-
-    state: str
-    pose: Array | None
-    cov: Array
-    hypotheses: int
-    risk: float
-    places: Array
-    weights: Array
-    pairs: NDArray[np.int64]
-    why: str = ""
-
-    @property
-    def committed(self) -> bool:
-        return self.pose is not None
 
 
 @dataclass(slots=True, kw_only=True)
@@ -368,7 +329,7 @@ class Engine:
             if renewed and len(p.pose) and p.risk <= OVERRULE * c.risk and self.track is not None:
                 other = anchored(h, self.index, c)
                 apart = np.hypot(*(other.mean[:2] - self.track.mean[:2]))
-                turn = abs((other.mean[2] - self.track.mean[2] + np.pi) % (2 * np.pi) - np.pi)
+                turn = abs(float(wrap(other.mean[2] - self.track.mean[2])))
                 elsewhere = apart > 1.0 + 3 * np.sqrt(self.track.cov[0, 0]) or turn > 0.2
                 if elsewhere and self._fits_worse(self.track):
                     self.losses += 1
@@ -403,59 +364,18 @@ class Engine:
     # -- saying ---------------------------------------------------------------------------------------------------
 
     def _belief(self, pairs: NDArray[np.int64]) -> Belief:
-        f = self.track
-        if f is not None:
-            pose, cov = f.mean[:3].copy(), f.cov[:3, :3].copy()
-            if self.graph is not None:
-                pose, cov = self.graph.pose.copy(), self.graph.scale * self.graph.cov
-            return Belief(
-                state=self.state,
-                pose=pose,
-                cov=cov,
-                hypotheses=1,
-                risk=self.risk,
-                places=pose[None],
-                weights=np.ones(1),
-                pairs=pairs,
-            )
-        p = self.hunt.posterior
-        n = 0
-        if len(p.p) and p.p.sum() > 0:
-            n = int(np.searchsorted(np.cumsum(p.p) / p.p.sum(), 0.99) + 1)
-        if n and p.unknown < 0.5:
-            self.state = "ambiguous"
-        elif self.state != "lost" or self.hunt.informed:
-            self.state = "searching"
-        robot = self.hunt.submap.filter.mean[:3]
-        shown = p.pose[: min(n, 200)]
-        c, s = np.cos(shown[:, 2]), np.sin(shown[:, 2])
-        places = np.stack(
-            [shown[:, 0] + c * robot[0] - s * robot[1], shown[:, 1] + s * robot[0] + c * robot[1], shown[:, 2] + robot[2]], axis=1
-        )  # fmt: skip
-        return Belief(
-            state=self.state,
-            pose=None,
-            cov=np.full((3, 3), np.nan),
-            hypotheses=n,
-            risk=p.risk,
-            places=places,
-            weights=p.p[: len(places)],
-            pairs=pairs,
-            why=self._why(),
-        )
-
-    def _why(self) -> str:
-        """What stands against a commit."""
+        if self.graph is not None:
+            return held(self.state, self.graph.pose.copy(), self.graph.scale * self.graph.cov, self.risk, pairs)
+        if self.track is not None:
+            return held(self.state, self.track.mean[:3].copy(), self.track.cov[:3, :3].copy(), self.risk, pairs)
         h, p = self.hunt, self.hunt.posterior
-        if self._blinded:
-            return CONTRADICTED
-        if not len(p.p):
-            return LITTLE if not h.informed else COARSE if h.found is not None and not h.found.seeds else ELSEWHERE
-        if p.unknown < 0.5 and p.alike < 0.5 * p.risk:
-            return SEVERAL
-        aside = SET_ASIDE * p.alike
-        rest = 1.0 - p.alike + aside
-        return ALIKE if (rest - p.p[0]) < 0.01 * rest else SEVERAL if p.unknown < 0.5 else ELSEWHERE
+        if likely(p) and p.unknown < 0.5:
+            self.state = "ambiguous"
+        elif self.state != "lost" or h.informed:
+            self.state = "searching"
+        tried = h.found is None or h.found.seeds > 0
+        why = CONTRADICTED if self._blinded else against(p, informed=h.informed, tried=tried)
+        return open_among(self.state, p, h.submap.filter.mean[:3], pairs, why)
 
 
 def on_top(map_pose: Array, frame_pose: Array) -> Array:
@@ -474,5 +394,5 @@ def anchored(hunt: _Hunt, index: MapIndex, config: LocalizeConfig) -> Filter:
         if t >= 0:
             f.fix(int(k), index.xy[t], scale * (index.var[t] + config.map_sigma**2) * np.eye(2))
             f.tree[k] = t
-    f.mean[2] = (f.mean[2] + np.pi) % (2 * np.pi) - np.pi
+    f.mean[2] = wrap(f.mean[2])
     return f

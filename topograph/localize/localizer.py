@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from topograph.bags import Imu, Odometry, Scan, Trunks
 from topograph.errors import InsufficientDataError
 from topograph.geometry import Array, from_xyz_rpy, transform, yaw_of
+from topograph.localize.belief import Belief
 from topograph.localize.config import LocalizeConfig
-from topograph.localize.engine import Belief, Engine
+from topograph.localize.engine import Engine
 from topograph.localize.method import Fix, Method, Report
 from topograph.localize.submap import Move, Sweep
 from topograph.motion import Leg, Reckoner
@@ -138,6 +139,21 @@ SHARED = 0.2
 take it away. (Sweeps in orchards of another simulator than ours, 30 trees in view: NEES 9 without it and 4 with it; in ours, with 10 in view, 2.3 and 1.9.)"""
 
 
+@dataclass(slots=True)
+class _Common:
+    """What the trees in view have in common, and no number of them takes away.
+
+    Attributes:
+        place: variance of their places in the map, m².
+        ground: of the ground under them, m², a running mean.
+        above: height above the base at which they are seen, m.
+    """
+
+    place: float = 0.0
+    ground: float = GROUND_SIGMA**2
+    above: float = 0.0
+
+
 class GraphMethod:
     """Ours: submap, search, evidence, track (see `Engine`), lifted from the plane to six degrees of freedom."""
 
@@ -151,9 +167,7 @@ class GraphMethod:
         self._slip = SlipWatch()
         self.contradicted = False
         self._last_p = np.zeros((0, 3))
-        self._seen_at = 0.0
-        self._ground = GROUND_SIGMA**2
-        self._shared = 0.0
+        self._common = _Common()
         self._above: deque[float] = deque(maxlen=REMEMBERED)
 
     def _stated(self, trunks: Trunks) -> Array:
@@ -200,10 +214,8 @@ class GraphMethod:
                 )  # fmt: skip
             self.engine = self._begin(heights)
         if len(trunks) and leg.seconds > 0 and np.array_equal(trunks.p, self._last_p):
-            trunks, heights = (
-                trunks.select(np.zeros(len(trunks), bool)),
-                heights[:0],
-            )  # a driver that repeats itself: nothing was seen
+            nothing = np.zeros(len(trunks), bool)  # a driver that repeats itself
+            trunks, heights = trunks.select(nothing), heights[nothing]
         else:
             self._last_p = trunks.p
         if not leg.level:
@@ -212,7 +224,7 @@ class GraphMethod:
         flat = transform(level_T_robot, trunks.p) if len(trunks) else np.zeros((0, 3))
         watched = self._slip.check(flat, leg)
         if len(flat):
-            self._seen_at = float(np.median(np.abs(flat[:, 2])))
+            self._common.above = float(np.median(np.abs(flat[:, 2])))
         self.move = move_of(watched, self.config)
         self.sweep, rows = sweep_of(trunks, level_T_robot, leg, self.config, np.nan_to_num(heights - self.height))
         self.contradicted = watched is not leg
@@ -226,10 +238,12 @@ class GraphMethod:
         self.sweep_pairs = belief.pairs
         belief = replace(belief, pairs=np.stack([rows[belief.pairs[:, 0]], belief.pairs[:, 1]], axis=1))
         self._rise(leg, belief, heights, flat)
-        fix = self._fix(trunks.stamp_ns, belief, leg) if belief.pose is not None else None
-        flat_cov = belief.cov[:2, :2]
-        if fix is not None:  # all that is open of the place in the map; where the map lies on Earth is another matter
-            flat_cov = fix.cov[np.ix_([3, 4], [3, 4])] - np.nan_to_num(self.topo.datum_cov)[:2, :2]
+        fix, flat_cov = None, belief.cov[:2, :2]
+        if belief.pose is not None:
+            map_T_robot, cov = self._placed(belief.pose, belief.cov, leg)
+            flat_cov = cov[3:5, 3:5].copy()
+            cov[3:, 3:] += np.nan_to_num(self.topo.datum_cov)  # where the map lies on Earth
+            fix = Fix(trunks.stamp_ns, map_T_robot, cov, belief.risk)
         side = np.array([-self._row[1], self._row[0]])
         along, across = self._row @ flat_cov @ self._row, side @ flat_cov @ side
         ids = self.topo.ids[np.unique(belief.pairs[:, 1])]
@@ -271,9 +285,9 @@ class GraphMethod:
         drift = (0.001 if leg.level else 0.02) ** 2 * leg.distance
         P += np.diag([(0.03 * leg.distance) ** 2 + 1e-6, drift, drift])
         if self.engine is not None and len(belief.pairs):
-            self._shared = SHARED**2 * float(self.engine.index.var[belief.pairs[:, 1]].mean())
+            self._common.place = SHARED**2 * float(self.engine.index.var[belief.pairs[:, 1]].mean())
         for i, t in belief.pairs:
-            self._ground += 0.02 * (GROUND_SIGMA**2 + _known(self.topo.cov[t, 2, 2]) - self._ground)
+            self._common.ground += 0.02 * (GROUND_SIGMA**2 + _known(self.topo.cov[t, 2, 2]) - self._common.ground)
             place = self.topo.p[t, 2] + (heights[i] if np.isfinite(heights[i]) else self.height)
             H = np.array([1.0, flat[i, 1], -flat[i, 0]])
             S = H @ P @ H + 0.12**2 + (0.01 * np.hypot(*flat[i, :2])) ** 2
@@ -283,24 +297,22 @@ class GraphMethod:
                 x += K * r
                 P -= np.outer(K, H @ P)
 
-    def _fix(self, stamp_ns: int, belief: Belief, leg: Leg) -> Fix:
-        assert belief.pose is not None
-        px, py, yaw = belief.pose
+    def _placed(self, pose: Array, flat_cov: Array, leg: Leg) -> tuple[Array, Array]:
+        """map_T_robot (4, 4) of a `pose` (3,) in the plane, and what is open of it within the map, (6, 6)."""
+        px, py, yaw = pose
         T = from_xyz_rpy(px, py, self._tilt[0], leg.roll + self._tilt[1], leg.pitch + self._tilt[2], yaw)
         cov = np.zeros((6, 6))
-        cov[np.ix_([3, 4, 2], [3, 4, 2])] = belief.cov
+        cov[np.ix_([3, 4, 2], [3, 4, 2])] = flat_cov
         turn = np.eye(3)  # roll and pitch are the robot's; the map's axes are turned from them by its heading
         turn[1:, 1:] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
         cov[np.ix_([5, 0, 1], [5, 0, 1])] = turn @ self._tilt_cov @ turn.T
         cov[[0, 1], [0, 1]] += 0.01**2
         cov[[3, 4], [3, 4]] += self._slip.standing**2
-        # What all trees of the map, or all grounds under them, have in common no number of sightings takes away.
-        cov[3:, 3:] += np.nan_to_num(self.topo.datum_cov)
-        cov[[3, 4], [3, 4]] += self._shared
-        cov[5, 5] += self._ground
+        cov[[3, 4], [3, 4]] += self._common.place
+        cov[5, 5] += self._common.ground
         if not leg.level:  # trunks that are seen so high above the base are shifted by the tilt, all alike
-            cov[[3, 4], [3, 4]] += (UNKNOWN_TILT * self._seen_at) ** 2
-        return Fix(stamp_ns, T, cov, belief.risk)
+            cov[[3, 4], [3, 4]] += (UNKNOWN_TILT * self._common.above) ** 2
+        return T, cov
 
 
 def _known(variance: float) -> float:

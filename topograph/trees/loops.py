@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from topograph.geometry import Array, planar, transform
+from topograph.geometry import Array, planar, transform, wrap
 from topograph.motion import Motion, MotionConfig
 from topograph.places import (
     Landmarks,
@@ -276,7 +276,7 @@ def recognise(
         return None
     # Integrated over the pose: a normal of what the trees leave open and of the drift.
     away = placed.pose - [*centre, 0.0]
-    away[:, 2] = (away[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    away[:, 2] = wrap(away[:, 2])
     total = off + _in_map(np.asarray(np.linalg.inv(placed.information)), placed.pose[:, 2])
     strayed = np.einsum("mi,mij,mj->m", away, np.linalg.inv(total), away)
     log = placed.log - 0.5 * strayed - 0.5 * np.linalg.slogdet(2 * np.pi * total)[1]

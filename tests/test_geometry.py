@@ -89,3 +89,17 @@ def test_align_se3_never_mirrors() -> None:
 def test_information_inverts_covariance(root: np.ndarray) -> None:
     cov = root @ root.T + 1e-4 * np.eye(3)
     np.testing.assert_allclose(g.inverse_cov(np.stack([cov, cov]))[1] @ cov, np.eye(3), atol=1e-6)
+
+
+@given(st.floats(0.2, 1.5), st.floats(0.0, 2.0), st.floats(0.005, 0.1), st.floats(0.005, 0.05))
+def test_a_trunk_is_known_best_where_it_was_seen(seen: float, height: float, lean: float, sigma: float) -> None:
+    """Against samples: a place seen at one height, an axis with an error of its own, the foot along it and from there up again."""
+    rng = np.random.default_rng(2)
+    place, slope = sigma * rng.normal(size=(4000, 2)), lean * rng.normal(size=(4000, 2))
+    foot = place - seen * slope
+    foot_cov = np.diag([*np.cov(foot.T)[[0, 1], [0, 1]], 0.01])[None]
+    up = np.array([[0.0, 0.0, 1.0]])
+    p, cov = g.above_ground(np.zeros((1, 3)), foot_cov, up, np.array([lean]), np.array([seen]), height)
+    np.testing.assert_allclose(p, [[0.0, 0.0, height]])
+    true = np.var(foot + height * slope, axis=0)
+    np.testing.assert_allclose(cov[0, [0, 1], [0, 1]], true, rtol=0.1, atol=0.1 * foot_cov[0, 0, 0])

@@ -42,6 +42,8 @@ def make(n: int, seed: int = 0, datum: Datum | None = HERE) -> TopoMap:
         p=p,
         cov=cov,
         axis=axis,
+        lean_sigma=np.where(rng.random(n) < 0.2, np.nan, 0.04),
+        known_at=rng.uniform(0.3, 1.2, n),
         diameter=diameter,
         first_branch=branch,
         sightings=rng.integers(1, 99, n),
@@ -73,6 +75,8 @@ def test_round_trip(tmp_path_factory: pytest.TempPathFactory, n: int, seed: int,
         "p",
         "cov",
         "axis",
+        "lean_sigma",
+        "known_at",
         "diameter",
         "first_branch",
         "kind",
@@ -217,18 +221,19 @@ def test_radius_rule() -> None:
 
 
 def test_an_older_map_is_read_as_a_map_of_trees(tmp_path: Path) -> None:
-    """Schema 1 knew no kinds: all its landmarks were meant as trees of one stem."""
+    """Schema 1 knew no kinds: all its landmarks were meant as trees of one stem; nor did it say how well axes are known."""
     path = tmp_path / "old.gpkg"
     m = make(7)
     store.save(m, path)
     with sqlite3.connect(path) as c:
-        for column in ("kind", "kind_probability", "stems"):
+        for column in ("kind", "kind_probability", "stems", "lean_sigma", "known_at"):
             c.execute(f"ALTER TABLE trees DROP COLUMN {column}")
         c.execute("UPDATE meta SET value='1' WHERE key='schema_version'")
         c.execute("DELETE FROM meta WHERE key LIKE 'digest:%'")
     got = store.load(path)
     assert got.is_tree.all()
     assert np.isnan(got.kind_probability).all()
+    np.testing.assert_array_equal(got.above_ground(0.8)[1], got.cov)
     np.testing.assert_array_equal(got.stems, 1)
     np.testing.assert_array_equal(got.p, m.p)
 

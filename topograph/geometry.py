@@ -112,6 +112,26 @@ def transform(pose: ArrayLike, points: ArrayLike) -> Array:
     return np.asarray((T[..., :3, :3] @ p[..., None])[..., 0] + T[..., :3, 3])
 
 
+LEAST_SHARE = 0.02
+"""Of the variances of a foot, what is open anywhere along its axis: covariances that were rounded, or merged, stay some."""
+
+
+def above_ground(
+    foot: Array, cov: Array, axis: Array, lean_sigma: Array, known_at: Array, height: float
+) -> tuple[Array, Array]:
+    """Points (T, 3) `height` m above ground on the axes (T, 3) of trunks, and their covariances (T, 3, 3), from those of their feet.
+
+    A foot was brought down from the height `known_at` (T,) at which its trunk was seen, along an axis known to `lean_sigma` (T,) rad; nearer to
+    there the lean's error weighs less. NaN: nobody says, and the foot's covariance stays.
+    """
+    p = foot + axis * (height / np.maximum(axis[:, 2:], 0.3))
+    change = np.nan_to_num(((height - known_at) ** 2 - known_at**2) * lean_sigma**2)
+    out = cov.copy()
+    flat = cov[:, [0, 1], [0, 1]]
+    out[:, [0, 1], [0, 1]] = np.maximum(flat + change[:, None], LEAST_SHARE * flat)
+    return p, out
+
+
 def skew(v: ArrayLike) -> Array:
     """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
     w = np.asarray(v, float)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from topograph.estimate import Fixes, Headings, KnownTrees, Problem
-from topograph.geometry import Array, Datum, Stamps, inverse, transform, yaw_of
+from topograph.geometry import Array, Datum, Stamps, above_ground, inverse, transform, yaw_of
 from topograph.trees import Detections
 from topograph.trees.sightings import nearest_keyframe
 
@@ -17,20 +17,23 @@ UNKNOWN = 1.0
 
 @dataclass(frozen=True, slots=True)
 class KnownMap:
-    """Feet (Q, 3) of the trees of a map, m, their covariances (Q, 3, 3), their axes (Q, 3), and the map's datum."""
+    """Feet (Q, 3) of the trees of a map, m, their covariances (Q, 3, 3), their axes (Q, 3), how well and where these are known (Q,) (see
+    `geometry.above_ground`), and the map's datum."""
 
     p: Array
     cov: Array
     axis: Array
+    lean_sigma: Array
+    known_at: Array
     datum: Datum | None
 
     def at(self, detections: Detections) -> KnownTrees:
         """The trees as landmarks: on their axes, at the height where the detections state theirs."""
         above = detections.height[np.isfinite(detections.height)]
         height = float(np.median(above)) if len(above) else 0.0
-        p = self.p + self.axis * (height / np.maximum(self.axis[:, 2:], 0.3))
-        unknown = np.isnan(self.cov.sum(axis=(1, 2)))
-        cov = np.where(unknown.reshape(-1, 1, 1), UNKNOWN * np.eye(3), self.cov)
+        unknown = np.isnan(self.cov.sum(axis=(1, 2))).reshape(-1, 1, 1)
+        cov = np.where(unknown, UNKNOWN * np.eye(3), self.cov)
+        p, cov = above_ground(self.p, cov, self.axis, self.lean_sigma, self.known_at, height)
         cov[:, [0, 1, 2], [0, 1, 2]] = np.maximum(cov[:, [0, 1, 2], [0, 1, 2]], 1e-5)
         return KnownTrees(p, cov, np.full(len(p), -1, np.int64))
 

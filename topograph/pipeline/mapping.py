@@ -49,7 +49,7 @@ def mapping_config(config: Config) -> MappingConfig:
 
 def known_map(topo: TopoMap) -> KnownMap:
     """What the loop needs of a map."""
-    return KnownMap(topo.p, topo.cov, topo.axis, topo.datum)
+    return KnownMap(topo.p, topo.cov, topo.axis, topo.lean_sigma, topo.known_at, topo.datum)
 
 
 def why_no_trees(solved: Solved) -> str:

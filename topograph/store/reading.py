@@ -62,14 +62,18 @@ def load(path: Path | str, *, clouds: bool = True, check: bool = True) -> TopoMa
         if check:
             check_digests(c, path)
         meta = dict(c.execute("SELECT key, value FROM meta NOT INDEXED"))
-        newer = ", kind, kind_probability, stems" if int(meta["schema_version"]) >= 2 else ", 'tree', NULL, 1"
+        version = int(meta["schema_version"])
+        newer = ", kind, kind_probability, stems" if version >= 2 else ", 'tree', NULL, 1"
+        newer += ", lean_sigma, known_at" if version >= 3 else ", NULL, NULL"
         rows = c.execute(
             "SELECT id, x, y, z, cov_xx, cov_xy, cov_yy, cov_zz, axis_x, axis_y, axis_z, diameter, first_branch, "
             'sightings, score, "row"' + newer + " FROM trees ORDER BY id"
         ).fetchall()
         v = np.array([[np.nan if x is None else x for x in r[:16]] for r in rows], float).reshape(-1, 16)
         kind = np.array([KINDS.index(r[16]) if r[16] in KINDS or check else 0 for r in rows], np.int64)
-        chance = np.array([np.nan if r[17] is None else r[17] for r in rows], float)
+        chance, lean_sigma, known_at = (
+            np.array([np.nan if r[k] is None else r[k] for r in rows], float) for k in (17, 19, 20)
+        )
         ids = v[:, 0].astype(np.int64)
         cov = np.zeros((len(v), 3, 3))
         cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 0] = v[:, 4], v[:, 5], v[:, 5]
@@ -116,6 +120,8 @@ def load(path: Path | str, *, clouds: bool = True, check: bool = True) -> TopoMa
             p=p,
             cov=cov,
             axis=v[:, 8:11],
+            lean_sigma=lean_sigma,
+            known_at=known_at,
             diameter=v[:, 11],
             first_branch=v[:, 12],
             sightings=sightings,

@@ -8,7 +8,7 @@ import numpy as np
 
 from topograph.geometry import Array, Datum
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 WGS84 = (
     'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563,AUTHORITY["EPSG","7030"]],'
     'AUTHORITY["EPSG","6326"]],PRIMEM["Greenwich",0,AUTHORITY["EPSG","8901"]],'
@@ -29,7 +29,7 @@ CREATE TABLE gpkg_extensions (table_name TEXT, column_name TEXT, extension_name 
 CREATE TABLE trees (id INTEGER PRIMARY KEY NOT NULL, geom POINT, x REAL, y REAL, z REAL, cov_xx REAL, cov_xy REAL,
   cov_yy REAL, cov_zz REAL, axis_x REAL, axis_y REAL, axis_z REAL, diameter REAL, first_branch REAL,
   sightings INTEGER, score REAL, "row" INTEGER, kind TEXT NOT NULL, kind_probability REAL, stems INTEGER NOT NULL,
-  state TEXT NOT NULL, block INTEGER NOT NULL, place TEXT NOT NULL);
+  state TEXT NOT NULL, block INTEGER NOT NULL, place TEXT NOT NULL, lean_sigma REAL, known_at REAL);
 CREATE TABLE edges (id INTEGER PRIMARY KEY NOT NULL, a INTEGER NOT NULL, b INTEGER NOT NULL, length REAL, geom LINESTRING);
 CREATE TABLE path (id INTEGER PRIMARY KEY NOT NULL, stamp_ns INTEGER NOT NULL, x REAL, y REAL, z REAL,
   qx REAL, qy REAL, qz REAL, qw REAL, geom POINT, session INTEGER NOT NULL);

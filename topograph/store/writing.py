@@ -76,13 +76,14 @@ def fill(c: sqlite3.Connection, t: TopoMap) -> None:
         )
     state, block, place = t.state, t.block, t.place
     c.executemany(
-        f"INSERT INTO trees VALUES ({','.join(23 * '?')})",
+        f"INSERT INTO trees VALUES ({','.join(25 * '?')})",
         [
             (
                 int(t.ids[i]), geometry(world[i : i + 1], srs), *real(t.p[i]),
                 *real([t.cov[i, 0, 0], t.cov[i, 0, 1], t.cov[i, 1, 1], t.cov[i, 2, 2]]), *real(t.axis[i]),
                 *real([t.diameter[i], t.first_branch[i]]), int(t.sightings[i]), *real([t.score[i]]), int(t.row[i]),
                 KINDS[int(t.kind[i])], *real([t.kind_probability[i]]), int(t.stems[i]), state[i], int(block[i]), place[i],
+                *real([t.lean_sigma[i], t.known_at[i]]),
             )
             for i in range(len(t))
         ],

@@ -54,6 +54,8 @@ def build(
         p=foot,
         cov=cov,
         axis=s.axis,
+        lean_sigma=np.sqrt(s.slope_var),
+        known_at=height,
         diameter=s.diameter,
         first_branch=_first_branch(n, viewpoints, s.axis),
         sightings=np.bincount(tree[tree >= 0], minlength=n),

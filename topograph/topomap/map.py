@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from topograph.geometry import Array, Datum, Stamps
+from topograph.geometry import Array, Datum, Stamps, above_ground
 from topograph.topomap.addresses import blocks_of, places_of
 from topograph.topomap.sessions import Seen, SessionRecord
 from topograph.trunks.score import KINDS, OTHER, TREE
@@ -39,6 +39,8 @@ class TopoMap:
     Attributes:
         ids: (T,) tree ids, stable when the map is extended.
         p: (T, 3) where the trunk's axis meets the ground, m; `cov` (T, 3, 3) m².
+        lean_sigma: (T,) of the axis, rad per horizontal axis, and the height `known_at` (T,) above ground at which its place is known best, m: what
+            is stated of the foot was brought down from there. NaN where nobody says.
         axis: (T, 3) unit vectors, up; `diameter` (T,) m or NaN; `first_branch` (T,) m above ground or NaN.
         sightings, score, row: (T,); row -1 where there are no rows.
         kind: (T,) index into KINDS; `kind_probability` (T,) or NaN; `stems` (T,). Edges and rows are of trees alone.
@@ -55,6 +57,8 @@ class TopoMap:
     p: Array
     cov: Array
     axis: Array
+    lean_sigma: Array
+    known_at: Array
     diameter: Array
     first_branch: Array
     sightings: NDArray[np.int64]
@@ -99,6 +103,8 @@ class TopoMap:
             p=np.column_stack([xy, np.zeros(n)]),
             cov=np.tile(sigma**2 * np.eye(3), (n, 1, 1)),
             axis=np.tile([0.0, 0.0, 1.0], (n, 1)),
+            lean_sigma=unknown,
+            known_at=unknown,
             diameter=unknown,
             first_branch=unknown,
             sightings=np.ones(n, np.int64),
@@ -135,6 +141,10 @@ class TopoMap:
         """Address of each tree: block, row, and number along the row."""
         return places_of(self.p[:, :2], self.block, self.row, self.is_tree)
 
+    def above_ground(self, height: float) -> tuple[Array, Array]:
+        """Where the axes are `height` m above ground (T, 3), m, and with what covariance (T, 3, 3), m²."""
+        return above_ground(self.p, self.cov, self.axis, self.lean_sigma, self.known_at, height)
+
     def ellipses(self) -> tuple[Array, Array]:
         """What holds 95 % of each tree's position: half axes (T, 2), the larger first, m, and the larger one's angle from east (T,), rad; NaN
         where the covariance is not known.
@@ -157,6 +167,8 @@ class TopoMap:
             "p",
             "cov",
             "axis",
+            "lean_sigma",
+            "known_at",
             "diameter",
             "first_branch",
             "sightings",

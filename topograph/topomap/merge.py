@@ -31,10 +31,12 @@ def merge(
     seen = tree_of_old >= 0
     fresh = np.setdiff1d(np.arange(len(new)), tree_of_old[seen])
 
-    def both(name: str) -> Array:
+    def both(name: str, taken: NDArray[np.bool_] = seen) -> Array:
         a, b = np.array(getattr(old, name)), getattr(new, name)
-        a[seen] = b[tree_of_old[seen]]
+        a[taken] = b[tree_of_old[taken]]
         return np.concatenate([a, b[fresh]])
+
+    surer = seen & ~_surer(old, new, tree_of_old)
 
     p = both("p")
     sightings = np.concatenate([old.sightings, new.sightings[fresh]])
@@ -72,8 +74,10 @@ def merge(
         datum=old.datum,
         ids=ids.astype(np.int64),
         p=p,
-        cov=_surer(old, new, tree_of_old, both("cov")),
+        cov=both("cov", surer),
         axis=both("axis"),
+        lean_sigma=both("lean_sigma", surer),
+        known_at=both("known_at", surer),
         diameter=both("diameter"),
         first_branch=both("first_branch"),
         sightings=sightings,
@@ -123,15 +127,14 @@ def _seen(
     return out.and_(missed)
 
 
-def _surer(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64], cov: Array) -> Array:
-    """Covariances (T, 3, 3) where a tree seen again is at least as sure as it was: what a tree's shape adds to its place is added to
-    each run's anew, though it is the same tree.
+def _surer(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Trees (T_old,) that the old map knows better than the new run: a tree seen again is at least as sure as it was, but what its shape adds to
+    its place is added to each run's anew, though it is the same tree.
     """
-    out = cov.copy()
-    for i in np.flatnonzero(tree_of_old >= 0).tolist():
-        if np.trace(old.cov[i][:2, :2]) < np.trace(new.cov[tree_of_old[i]][:2, :2]):
-            out[i] = old.cov[i]
-    return out
+    if not len(new):
+        return np.zeros(len(old), bool)
+    before, now = (np.trace(t.cov[:, :2, :2], axis1=1, axis2=2) for t in (old, new))
+    return np.asarray(before < now[tree_of_old])
 
 
 def _told_better(old: TopoMap, new: TopoMap, tree_of_old: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -390,6 +390,20 @@ def test_attitude_of_a_robot_that_starts_in_a_turn(speed: float, rate: float, pi
             assert leg.tilt_sigma > 0.02
 
 
+@pytest.mark.parametrize("every", [1, 10, 100])
+def test_how_often_it_is_asked_makes_the_tilt_no_surer(every: int) -> None:
+    """After a minute gravity's own deviation is left, whether a scan came every hundredth of a second or each second."""
+    reckoner = Reckoner(robot_R_imu=np.eye(3))
+    for k in range(6001):
+        t = 0.01 * k
+        if k % 2 == 0:
+            reckoner.add(odometry_at(t, t, 0.0, 0.0))
+        reckoner.add(imu_at(t, 0.0))
+        if k % every == 0 and k > 0:
+            leg = reckoner.advance(BEGIN + round(1e9 * t))
+    assert 0.01 <= leg.tilt_sigma < 0.012
+
+
 # -- the thesis's method ------------------------------------------------------------------------------------------
 
 

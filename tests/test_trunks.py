@@ -290,6 +290,19 @@ def test_a_post_beside_a_tree_is_kept_apart() -> None:
     assert suppress(fits, odds, np.array([-1.0, 1.0]), 0.45).tolist() == [0, 0]
 
 
+@pytest.mark.parametrize(("begins", "stems"), [(0.3, 2), (0.8, 1)])
+def test_a_branch_is_no_stem_and_does_not_move_the_trunk(begins: float, stems: int) -> None:
+    """Two thin things of one tree, 0.3 m apart: one beside the other from the ground on, or from breast height."""
+    fits = np.zeros((2, OUT_SIZE))
+    fits[:, X], fits[:, AXIS_Z] = [4.0, 4.3], 1.0
+    fits[:, fit.RINGS], fits[:, fit.POINTS], fits[:, fit.WIDE], fits[:, fit.STEMS] = 6, [60, 40], 0.08, 1
+    lowest, highest = np.array([0.3, begins]), np.array([1.6, 1.6])
+    best, merged = fit.merge_stems(fits, np.array([5.0, 4.0]), np.array([0, 0]), lowest, highest)
+    np.testing.assert_array_equal(best, [0])
+    assert merged[0, fit.STEMS] == stems
+    assert merged[0, X] == pytest.approx(4.12 if stems == 2 else 4.0)
+
+
 @pytest.mark.parametrize("bearing", [0.0, 0.7, np.pi / 2, 2.5])
 def test_covariances_lie_along_the_line_of_sight(bearing: float) -> None:
     """A trunk is unsure in range as stated, and across it as stated, wherever it stands."""

@@ -371,7 +371,9 @@ class Reckoner:
         tau = np.clip(a.age + np.cumsum(dt), 0.5, self.tilt_time_s)
         q = gravity_kernel(a.q, rate, force, np.minimum(dt, 1e-9 * GYRO_GAP_NS), tau, GRAVITY)
         fade = float(np.exp(-np.sum(dt / tau)))
-        sigma = float(np.hypot(LEVEL_SIGMA, a.sigma * fade)) if covered else MOVING_SIGMA
+        # Gravity's own deviation stays, however often it is asked; what is beyond it fades.
+        beyond = fade**2 * max(a.sigma**2 - LEVEL_SIGMA**2, 0.0)
+        sigma = float(np.sqrt(LEVEL_SIGMA**2 + beyond)) if covered else MOVING_SIGMA
         self._attitude = _Attitude(stamp_ns, q[-1], a.age + float(dt.sum()), sigma)
         self._sample = last
         self._resting = [m[:2] for m in used[-200:]]

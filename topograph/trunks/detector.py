@@ -25,6 +25,7 @@ from topograph.trunks.runs import FIRST, LAST, RUN_SIZE, find_runs, heights, lin
 _NO_TIME = np.zeros(0, np.float32)
 SURE = float(np.log(0.7))
 """Log-probability from which a candidate's kind is taken at its word."""
+_LOWEST, _HIGHEST = FEATURES.index("lowest"), FEATURES.index("highest")
 STEM_DISTANCE = 0.45
 """Two trunks whose axes come that near are stems or pieces of one tree, m."""
 
@@ -150,7 +151,8 @@ class Detector:
         fits, kinds, odds, name = c.fits[keep], kinds[keep], odds[keep], c.name[keep]
         post = (kinds[:, scoring.POST] > SURE).astype(float) - (kinds[:, scoring.TREE] > SURE)
         group = suppress(fits, odds, post, STEM_DISTANCE)
-        best, merged = merge_stems(fits, scoring.tree_odds(kinds), group)
+        lowest, highest = c.features[keep][:, _LOWEST], c.features[keep][:, _HIGHEST]
+        best, merged = merge_stems(fits, scoring.tree_odds(kinds), group, lowest, highest)
         wanted = np.full(len(c.runs), -1, np.int64)
         wanted[name] = np.searchsorted(best, group)
         rows, ends = gather(wanted, len(best), c.chain, c.runs, c.label, FIRST, LAST)

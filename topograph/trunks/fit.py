@@ -262,11 +262,16 @@ def suppress(out, score, post, distance):
     return group
 
 
+BRANCH = 0.15
+"""Besides the distance between rings, what begins so much higher than the trunk beside it is a branch, m."""
+
+
 @njit(cache=True, error_model="numpy")
-def merge_stems(fits, odds, group):
+def merge_stems(fits, odds, group, lowest, highest):
     """Rows (B,) of the best of each group, and their fits (B, OUT_SIZE): stems of one tree meet at its foot, and their
     mean, by points, stands for the tree. A stem is as thick as a third of the best, stands beside it, and its log-odds of
-    being a tree, `odds` (C,), are positive and half of the best's.
+    being a tree, `odds` (C,), are positive and half of the best's. It begins as low, of the rings `lowest` to `highest` (C,) m above ground that
+    show them: what begins higher is a branch, and no part of where the trunk stands.
     """
     n = len(group)
     best = np.empty(n, np.int64)
@@ -284,6 +289,8 @@ def merge_stems(fits, odds, group):
             if group[j] != i or fits[j, WIDE] < 0.33 * fits[i, WIDE]:
                 continue
             if j != i and odds[j] <= max(0.5 * odds[i], 0.0):
+                continue
+            if lowest[j] > lowest[i] + BRANCH + (highest[i] - lowest[i]) / max(fits[i, RINGS] - 1.0, 1.0):
                 continue
             total += fits[j, POINTS]
             stems += 1

@@ -96,7 +96,7 @@ BREAKS = [
     Break("thesis: antenna at the base", T + "estimate/ekf.py", "f.map_p_antenna[i] - x[:3] - lever, H", "f.map_p_antenna[i] - x[:3], H", NUMBERS + " -k 'thesis'"),
     Break("Delaunay for Gabriel", T + "topomap/edges.py", "keep &= distance**2 >= half2 * (1 - 1e-9)", "pass", P + "test_store.py"),
     Break("a tree gets another one's row", T + "topomap/rows.py", "row[order] = band", "row[order[::-1]] = band", NUMBERS + " -k 'rows'"),
-    Break("--into: old trees not updated", T + "topomap/merge.py", "a[seen] = b[tree_of_old[seen]]", "pass", P + "test_cli.py"),
+    Break("--into: old trees not updated", T + "topomap/merge.py", "a[taken] = b[tree_of_old[taken]]", "pass", P + "test_cli.py"),
     Break("viewpoint's direction reversed", T + "topomap/build.py", "v = map_T_scan[detections.scan[mine], :3, 3] - foot[j]  # eq. 4.13", "v = foot[j] - map_T_scan[detections.scan[mine], :3, 3]  # eq. 4.13", NUMBERS + " -k 'viewpoints'"),
     Break("clouds' CRC not checked", T + "store/reading.py", "if zlib.crc32(blob) != crc or", "if", P + "test_store.py"),
     Break("written in place", T + "whole.py", 'os.replace(part, path)', "path.write_bytes(part.read_bytes())", P + "test_store.py"),

@@ -37,7 +37,7 @@ def trunks(
 
     GTSAM states a bearing's error in the basis at the *predicted* direction, and across the least of the axes that basis turns by 90°: a trunk
     straight abeam would have its height weighed as its side. `expected` (N, 3) is where the values to begin from have the trunks on the
-    robot, m; the measurements themselves where it is not given.
+    robot, m; the measurements themselves where it is not given, or points elsewhere.
 
     Raises:
         ValueError: as `trunk`.
@@ -46,7 +46,9 @@ def trunks(
     if not (np.isfinite(distance).all() and (distance >= 0.01).all()):
         raise ValueError("a trunk must be finite and not inside the sensor")
     unit = robot_p_trunk / distance[:, None]
-    basis = bearing_basis(unit if expected is None else expected / np.linalg.norm(expected, axis=1, keepdims=True))
+    towards = unit if expected is None else expected / np.maximum(np.linalg.norm(expected, axis=1, keepdims=True), 1e-9)
+    near = np.sum(towards * unit, axis=1) > NEAR
+    basis = bearing_basis(np.where(near[:, None], towards, unit))
     J = np.concatenate([np.swapaxes(basis, 1, 2) / distance[:, None, None], unit[:, None, :]], axis=1)
     turned = J @ cov @ np.swapaxes(J, 1, 2)
     turned = 0.5 * (turned + np.swapaxes(turned, 1, 2))
@@ -59,6 +61,10 @@ def trunks(
         noise = create(c) if estimator is None else robustly(estimator, create(c))
         out.append(gtsam.BearingRangeFactor3D(k, j, gtsam.Unit3(p), r, noise))
     return out
+
+
+NEAR = 0.7
+"""Cosine between two directions whose tangent planes are nearly one."""
 
 
 def bearing_basis(unit: Array, *, exact: bool = False) -> Array:

@@ -124,6 +124,8 @@ def test_how_well_the_map_is_known_is_learnt(map_sigma: float, low: float, high:
         w = World(seed, map_sigma=map_sigma)
         h = w.begin(config)
         assert h.scale == 1.0
+        assert w.begin(LocalizeConfig(map_sigma=0.2)).scale == 1.0
+        assert w.begin(LocalizeConfig(map_sigma=0.005)).scale == 1.0
         for _ in range(70):
             h.step(*w.step())
         scales.append(h.scale)

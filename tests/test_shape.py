@@ -127,8 +127,9 @@ def test_stems_of_one_foot_are_one_tree(feet_apart: float, slopes: tuple[float, 
     assert len(np.unique(refine(table, tree, TreesConfig()))) == trees  # and it stays so
 
 
+@pytest.mark.parametrize("widths", [(0.6, 0.6), (0.25, 0.8)])
 @pytest.mark.parametrize("apart", [0.5, 0.6, 0.9])
-def test_pieces_of_a_thick_trunk_do_not_go_to_and_fro(apart: float) -> None:
+def test_pieces_of_a_thick_trunk_do_not_go_to_and_fro(apart: float, widths: tuple[float, float]) -> None:
     """Many tracks of two faces of one trunk: what was joined by its width does not leave for its distance, only to be joined again."""
     face = np.repeat([0, 1], (20, 16))
     n = len(face)
@@ -136,7 +137,7 @@ def test_pieces_of_a_thick_trunk_do_not_go_to_and_fro(apart: float) -> None:
         rng = np.random.default_rng(seed)
         at = np.column_stack([apart * face, 0.0 * face]) + rng.normal(0, 0.03, (n, 2))
         table = TrackTable(
-            place=at, foot=at, width=np.full(n, 0.6), post=np.full(n, -3.0), sigma=rng.uniform(0.01, 0.03, n),
+            place=at, foot=at, width=np.array(widths)[face], post=np.full(n, -3.0), sigma=rng.uniform(0.01, 0.03, n),
             first=np.zeros(n), last=np.ones(n), hits=rng.integers(3, 400, n),
         )  # fmt: skip
         tree = refine(table, np.arange(n), TreesConfig())

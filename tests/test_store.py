@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from topograph import store
 from topograph.errors import MapError
 from topograph.geometry import Datum, exp
+from topograph.store.digest import digest
 from topograph.topomap import TopoMap, TopomapConfig, Viewpoint, neighbours
 
 HERE = Datum(40.1, -8.2, 90.0)
@@ -218,6 +219,24 @@ def test_radius_rule() -> None:
     xy = np.array([[0.0, 0.0], [3.0, 0.0], [10.0, 0.0]])
     config = replace(TopomapConfig(), edges="radius", radius=5.0)
     np.testing.assert_array_equal(neighbours(xy, config), [[0, 1]])
+
+
+def test_a_map_that_knows_no_leans_is_read(tmp_path: Path) -> None:
+    """Schema 2 did not say how well axes are known."""
+    path = tmp_path / "old.gpkg"
+    m = make(7)
+    store.save(m, path)
+    with sqlite3.connect(path) as c:
+        for column in ("lean_sigma", "known_at"):
+            c.execute(f"ALTER TABLE trees DROP COLUMN {column}")
+        c.execute("UPDATE meta SET value='2' WHERE key='schema_version'")
+        c.execute("DELETE FROM meta WHERE key IN ('digest:trees', 'digest:meta')")
+        for table in ("trees", "meta"):
+            c.execute("INSERT INTO meta (key, value) VALUES (?, ?)", (f"digest:{table}", digest(c, table)))
+    got = store.load(path)
+    np.testing.assert_array_equal(got.kind, m.kind)
+    assert np.isnan(got.lean_sigma).all()
+    np.testing.assert_array_equal(got.above_ground(0.8)[1], got.cov)
 
 
 def test_an_older_map_is_read_as_a_map_of_trees(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from test_estimate import problem
 
 from topograph.geometry import Array, from_xyz_rpy, inverse, planar, transform, wrap, yaw_of
+from topograph.mapping.association import Made
 from topograph.motion import Motion, MotionConfig
 from topograph.trees import Tracker, TreesConfig, follow, screen, tabulate
 from topograph.trees.whole import misstep
@@ -169,3 +170,20 @@ def test_metres_along_a_leaning_axis_are_no_metres_on_the_ground() -> None:
     leaning = replace(d, axis=axis, cov=d.cov + along)
     assert 0.03 < leaning.sigma[0] < 0.06  # a decimetre a metre, and half a metre of it
     assert replace(leaning, cov=d.cov).sigma[0] == pytest.approx(0.03, rel=0.01)
+
+
+def test_what_was_decided_is_the_same_whatever_trees_are_called() -> None:
+    """A renamed tree moves the rows of those between; a tree that was given up for another one is another decision."""
+    tree = np.repeat([0, 1, 2, -1], (400, 300, 200, 100))
+    forked, slope = np.array([False, True, False]), np.array([[0.1, 0.0], [0.2, 0.0], [0.3, 0.0]])
+    made = Made(forked, slope, tree)
+    order = np.array([2, 0, 1, -1])
+    renamed = Made(forked[[1, 2, 0]], slope[[1, 2, 0]], order[tree])
+    rows = renamed.like(made)
+    assert rows is not None
+    np.testing.assert_array_equal(renamed.slope[rows[0]], made.slope[rows[1]])
+    assert renamed._replace(forked=forked).like(made) is None
+    assert made._replace(tree=np.array([0, 1, -1, 2])[tree]).like(made) is None
+    few = tree.copy()
+    few[399] = 1
+    assert made._replace(tree=few).like(made) is None

@@ -93,7 +93,7 @@ def inverse(pose: ArrayLike) -> Array:
 
 
 def inverse_cov(cov: ArrayLike) -> Array:
-    """Information (..., 3, 3) of covariances (..., 3, 3): the adjugate over the determinant, a third of LAPACK's time for many of them."""
+    """Information (..., 3, 3) of positive definite covariances (..., 3, 3): the adjugate over the determinant, a third of LAPACK's time for many."""
     C = np.asarray(cov, float)
     (a, b, c), (d, e) = (C[..., 0, k] for k in range(3)), (C[..., 1, k] for k in (1, 2))
     f = C[..., 2, 2]

@@ -145,7 +145,8 @@ class Hypothesis:
         total, n = self._gone + self._told(list(self._last_seen))
         taken = self.config.map_sigma**2
         free = 2.0 * n / max(2.0 * n - 3.0, 1.0)  # the pose takes up what they have in common
-        found = float(np.clip((TAKEN * taken + free * total) / (TAKEN + n), PLACE[0] ** 2, PLACE[1] ** 2))
+        least, most = min(PLACE[0] ** 2, taken), max(PLACE[1] ** 2, taken)
+        found = float(np.clip((TAKEN * taken + free * total) / (TAKEN + n), least, most))
         own = float(np.mean(self.var[list(self._last_seen)])) - taken if self._last_seen else 0.0
         return (own + found) / (own + taken)
 

@@ -197,6 +197,10 @@ class GraphMethod:
             self.config,
         )
 
+    def remember(self, former: GraphMethod) -> None:
+        """What another method has learnt of this detector."""
+        self._above.extend(former._above)
+
     def begin_at(self, map_T_robot: Array, cov: Array, trunks: Trunks) -> None:
         """Track from a pose (4, 4) that somebody else is sure of, with the covariance (3, 3) of its x, y and yaw; `trunks` say at
         which height this front end states them.
@@ -209,6 +213,10 @@ class GraphMethod:
 
     def step(self, trunks: Trunks, leg: Leg) -> Report:
         """One scan further."""
+        if len(trunks) and leg.seconds > 0 and np.array_equal(trunks.p, self._last_p):
+            trunks = trunks.select(np.zeros(len(trunks), bool))  # a driver that repeats itself: nothing was seen
+        else:
+            self._last_p = trunks.p
         heights = self._stated(trunks)
         if self.engine is None:
             if not len(trunks):
@@ -217,20 +225,15 @@ class GraphMethod:
                     trees=np.zeros(0, np.int64), pairs=np.zeros((0, 2), np.int64), along=np.nan, across=np.nan,
                 )  # fmt: skip
             self.engine = self._begin(heights)
-        if len(trunks) and leg.seconds > 0 and np.array_equal(trunks.p, self._last_p):
-            nothing = np.zeros(len(trunks), bool)  # a driver that repeats itself
-            trunks, heights = trunks.select(nothing), heights[nothing]
-        else:
-            self._last_p = trunks.p
         if not leg.level:
             leg = self._upright(leg, trunks)
         level_T_robot = from_xyz_rpy(0, 0, 0, leg.roll, leg.pitch, 0)
         flat = transform(level_T_robot, trunks.p) if len(trunks) else np.zeros((0, 3))
         watched = self._slip.check(flat, leg)
-        if len(flat):
-            self._common.above = float(np.median(np.abs(flat[:, 2])))
         self.move = move_of(watched, self.config)
         self.sweep, rows = sweep_of(trunks, level_T_robot, leg, self.config, np.nan_to_num(heights - self.height))
+        if len(rows):
+            self._common.above = float(np.median(np.abs(flat[rows, 2])))
         self.contradicted = watched is not leg
         belief = self.engine.step(
             move_of(leg, self.config),

@@ -208,7 +208,7 @@ def associate_and_solve(
     progress("solve", 0.0)
     del a.seen  # as large as the detections, and from here on each decision makes its own
     after = a.decide(estimate)
-    earlier: list[_Made] = []
+    earlier: list[Made] = []
     moving: graph.Moving | None = None
     for n in range(LAST_ROUNDS if config.trees.reassociate else 1):
         decided = after
@@ -216,11 +216,14 @@ def associate_and_solve(
         moving = converged.moving
         progress("solve", (n + 1) / LAST_ROUNDS)
         after = a.decide(converged.estimate)
-        made, former = _Made.of(after), _Made.of(decided)
-        if made.like(former):
-            if np.abs(after.shapes.slope - decided.shapes.slope).max(initial=0.0) < SETTLED:
+        made, former = Made.of(after), Made.of(decided)
+        rows = made.like(former)
+        if rows is not None:
+            if np.abs(made.slope[rows[0]] - former.slope[rows[1]]).max(initial=0.0) < SETTLED:
                 break
-        elif any(made.like(m) for m in earlier):  # a track goes to and fro between two trees, and would for ever
+        elif any(
+            made.like(m) is not None for m in earlier
+        ):  # a track goes to and fro between two trees, and would for ever
             break
         earlier.append(former)
     del after
@@ -234,29 +237,36 @@ FLIPS = 1e-4
 """Share of the detections that may go to and fro between two trees: nothing moves by them."""
 
 
-class _Made(NamedTuple):
-    """What a decision made: which trees (T,) are forked, and the tree (N,) of each detection."""
+class Made(NamedTuple):
+    """What a decision made: which trees (T,) are forked, their slopes (T, 2), and the tree (N,) of each detection, -1 none."""
 
     forked: NDArray[np.bool_]
+    slope: Array
     tree: NDArray[np.int64]
 
     @staticmethod
-    def of(decided: Decided) -> _Made:
-        return _Made(decided.shapes.forked, decided.tree)
+    def of(decided: Decided) -> Made:
+        return Made(decided.shapes.forked, decided.shapes.slope, decided.tree)
 
-    def like(self, other: _Made) -> bool:
-        """The same trees, made of the same detections, whatever they are called: a tree whose first track goes to another takes a new name."""
+    def like(self, other: Made) -> NDArray[np.int64] | None:
+        """Rows (2, M) of the trees that are one, where both made the same trees of the same detections, whatever they are called: a tree whose
+        first track goes to another takes a new name. None where they did not.
+        """
         if len(self.forked) != len(other.forked):
-            return False
-        pairs, count = np.unique(np.stack([self.tree, other.tree]), axis=1, return_counts=True)
-        pairs, count = pairs[:, np.argsort(-count, kind="stable")], np.sort(count)[::-1]
-        # Each tree and the one that has most of its detections; those are one where each is the other's.
-        mine, theirs = (np.unique(side, return_index=True)[1] for side in pairs)
-        same = np.intersect1d(mine, theirs)
-        trees = pairs[:, same][:, (pairs[:, same] >= 0).all(axis=0)]
-        if not np.array_equal(self.forked[trees[0]], other.forked[trees[1]]):
-            return False
-        return int(count.sum() - count[same].sum()) <= FLIPS * len(self.tree)
+            return None
+        size = len(other.forked) + 1
+        key, count = np.unique((self.tree + 1) * size + other.tree + 1, return_counts=True)
+        order = np.argsort(-count, kind="stable")
+        mine, theirs, count = key[order] // size - 1, key[order] % size - 1, count[order]
+        # Each tree and the one that has most of its detections; those are one where each is the other's, and nothing is one with nothing.
+        mine_first, theirs_first = (np.unique(side, return_index=True)[1] for side in (mine, theirs))
+        same = np.intersect1d(mine_first, theirs_first)
+        same = same[(mine[same] < 0) == (theirs[same] < 0)]
+        if int(count.sum() - count[same].sum()) > FLIPS * len(self.tree):
+            return None
+        same = same[mine[same] >= 0]
+        rows = np.stack([mine[same], theirs[same]])
+        return rows if np.array_equal(self.forked[rows[0]], other.forked[rows[1]]) else None
 
 
 LAST_ROUNDS = 8

@@ -202,6 +202,8 @@ class Live:
             self._localizer.reckoner = self._reckoner
             self._localizer.leg = self._reckoner.advance(trunks.stamp_ns)
         method = GraphMethod(self.topo, self.config.localize)
+        if isinstance(self._localizer.method, GraphMethod):
+            method.remember(self._localizer.method)
         way = float(np.linalg.norm(now[:2, 3] - found.map_T_robot[:2, 3]))
         off, turn = 0.03 + DRIFT * way, 0.005 + DRIFT_YAW * way
         method.begin_at(now, np.diag([off**2, off**2, turn**2]), trunks)

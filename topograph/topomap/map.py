@@ -39,7 +39,7 @@ class TopoMap:
     Attributes:
         ids: (T,) tree ids, stable when the map is extended.
         p: (T, 3) where the trunk's axis meets the ground, m; `cov` (T, 3, 3) m².
-        lean_sigma: (T,) of the axis, rad per horizontal axis, and the height `known_at` (T,) above ground at which its place is known best, m: what
+        lean_sigma: (T,) of the axis that `cov` rests on, rad per horizontal axis, and the height `known_at` (T,) above ground at which its place is known best, m: what
             is stated of the foot was brought down from there. NaN where nobody says.
         axis: (T, 3) unit vectors, up; `diameter` (T,) m or NaN; `first_branch` (T,) m above ground or NaN.
         sightings, score, row: (T,); row -1 where there are no rows.

@@ -73,9 +73,9 @@ def _leave(tracks: TrackTable, tree: NDArray[np.int64], config: TreesConfig, pat
             centre = np.array([weighted_median(at[:, k], tracks.hits[group]) for k in range(2)])
             d = np.minimum(d, np.linalg.norm(at - centre, axis=1))
         bound = np.sqrt(config.gate * (tracks.sigma[group] ** 2 + 2 * config.floor**2))
-        width = np.average(tracks.width[group], weights=tracks.hits[group])
+        width = np.maximum(tracks.width[group], np.average(tracks.width[group], weights=tracks.hits[group]))
         # What would be joined again does not leave: else it went to and fro from round to round.
-        bound = np.maximum(bound, _near(np.asarray(width), config))
+        bound = np.maximum(bound, _near(width, config))
         for g in group[d > np.maximum(bound, patience)]:
             tree[g] = fresh
             fresh += 1

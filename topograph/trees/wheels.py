@@ -40,12 +40,16 @@ def with_trunks_way(motion: Motion, d: Detections, fix_ns: Stamps) -> Motion:
         return motion
     odom_T_robot = motion.at(d.stamps_ns)
     scans_ns = np.column_stack([d.stamps_ns[:-1], d.stamps_ns[1:]])
-    ns, legs = _legs(odom_T_robot, d, _with_neighbours(~_near(fix_ns, scans_ns), d.stamps_ns))
+    asked = _with_neighbours(~_near(fix_ns, scans_ns), d.stamps_ns)
+    ns, legs = _legs(odom_T_robot, d, asked)
     if len(legs) < LEGS:
         return motion
     slipping = _slipping(ns, legs) & ~_near(fix_ns, ns)
-    driven = np.linalg.norm(np.diff(odom_T_robot[:, :2, 3], axis=0), axis=1)
-    if not slipping.any() or slipping.sum() > MOST * max(int((driven > 0.01).sum()), 1):
+    driven = np.linalg.norm(np.diff(odom_T_robot[:, :2, 3], axis=0), axis=1) > 0.01
+    told = (
+        driven.sum() * len(legs) / asked.sum()
+    )  # of all that was driven, as much as trunks tell of where they are asked
+    if not slipping.any() or slipping.sum() > MOST * max(told, 1.0):
         return motion
     return _corrected(motion, ns, legs, slipping)
 

@@ -271,7 +271,7 @@ def merge_stems(fits, odds, group, lowest, highest):
     """Rows (B,) of the best of each group, and their fits (B, OUT_SIZE): stems of one tree meet at its foot, and their
     mean, by points, stands for the tree. A stem is as thick as a third of the best, stands beside it, and its log-odds of
     being a tree, `odds` (C,), are positive and half of the best's. It begins as low, of the rings `lowest` to `highest` (C,) m above ground that
-    show them: what begins higher is a branch, and no part of where the trunk stands.
+    show them, as the best does: what begins higher is a branch, and no part of where the trunk stands.
     """
     n = len(group)
     best = np.empty(n, np.int64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,18 +81,10 @@ def factors_of(
             yield from ((kind, f) for f in part)
 
 
-def graph_of(
-    problem: Problem,
-    p: Pass,
-    config: EstimateConfig,
-    inert: Inertia | None,
-    values: Any,
-    *,
-    without: Container[str] = (),
-) -> Any:
-    """A NonlinearFactorGraph of the factors whose kind is not in `without`; see `factors_of`."""
+def graph_of(chosen: Iterable[tuple[str, Any]]) -> Any:
+    """A NonlinearFactorGraph of factors with their kinds."""
     g = gtsam.NonlinearFactorGraph()
-    for _, f in factors_of(problem, p, config, inert, values, without=without):
+    for _, f in chosen:
         g.add(f)
     return g
 

@@ -22,7 +22,7 @@ import factors
 from factors import Kernel
 from topograph.errors import InsufficientDataError
 from topograph.estimate import covariance
-from topograph.estimate.generator import B, L, Pass, V, X, fix_cov, graph_of, orthonormal, path_of, trees_of
+from topograph.estimate.generator import B, L, Pass, V, X, factors_of, fix_cov, graph_of, orthonormal, path_of, trees_of
 from topograph.estimate.inertia import Inertia, inertia
 from topograph.estimate.initial import initial_path, yaw_of_direction
 from topograph.estimate.offsets import tested
@@ -103,7 +103,7 @@ def quick(problem: Problem, config: EstimateConfig, *, patient: bool = False) ->
     huber = Kernel("huber", config.huber)
     first = Pass(trunk=huber, fix=huber, fix_floor=0.05, height=QUICK_HEIGHT)
     steps, tolerance = (3 * config.iterations, MINIMUM) if patient else (10, NEAR)
-    values = optimised(graph_of(problem, first, config, None, values), values, steps, tolerance)
+    values = optimised(graph_of(factors_of(problem, first, config, None, values)), values, steps, tolerance)
     return _estimate(problem, config, values, first, None, time.perf_counter() - began)
 
 
@@ -119,18 +119,22 @@ def converge(problem: Problem, config: EstimateConfig, former: Moving | None = N
             values.update(B + k, former.values.atConstantBias(B + k))
     huber = Kernel("huber", config.huber)
     first = Pass(trunk=huber, fix=huber, fix_floor=0.0)
-    values = optimised(graph_of(problem, first, config, inert, values), values, 3 * config.iterations, MINIMUM)
+    values = optimised(
+        graph_of(factors_of(problem, first, config, inert, values)), values, 3 * config.iterations, MINIMUM
+    )
     scales = _learned_scales(problem, values, first) if config.learn_scale else (1.0, 1.0, 1.0)
     tukey = Kernel("tukey", config.tukey)
     last = Pass(trunk=tukey, fix=tukey, trunk_scale=scales[0], fix_scale=scales[1], alike=scales[2])
-    values = optimised(graph_of(problem, last, config, inert, values), values, config.iterations, MINIMUM)
+    values = optimised(graph_of(factors_of(problem, last, config, inert, values)), values, config.iterations, MINIMUM)
     for _ in range(RELEARNT if config.learn_scale else 0):
         scales = _learned_scales(problem, values, last)
         if scales[0] > STALE * last.trunk_scale and scales[1] > STALE * last.fix_scale:
             break
         less = (min(scales[0], last.trunk_scale), min(scales[1], last.fix_scale))
         last = replace(last, trunk_scale=less[0], fix_scale=less[1], alike=scales[2])
-        values = optimised(graph_of(problem, last, config, inert, values), values, config.iterations, MINIMUM)
+        values = optimised(
+            graph_of(factors_of(problem, last, config, inert, values)), values, config.iterations, MINIMUM
+        )
     estimate = _estimate(problem, config, values, last, None, time.perf_counter() - began)
     return Converged(problem, last, Moving(inert, values), estimate, began)
 
@@ -191,7 +195,9 @@ def _poses_alone(problem: Problem, poses: Array, config: EstimateConfig) -> Arra
             Pass(trunk=_NONE, fix=Kernel("huber", 1.345), fix_floor=1.0),
             Pass(trunk=_NONE, fix=Kernel("cauchy", 1.0), fix_floor=0.1),
         ):
-            values = optimised(graph_of(problem, p, config, None, values, without=("trunk", "tree")), values, 30, 1e-4)
+            values = optimised(
+                graph_of(factors_of(problem, p, config, None, values, without=("trunk", "tree"))), values, 30, 1e-4
+            )
     return path_of(problem, values)
 
 
@@ -274,7 +280,7 @@ tree whose sightings contradict each other may creep on for many steps, and move
 def _polish(problem: Problem, p: Pass, config: EstimateConfig, inert: Inertia | None, values: Any) -> tuple[Any, Any]:
     """Gauss-Newton with Cartesian trunk residuals until steps are below `POLISHED`; the values and the last system."""
     ordering = None
-    rest = graph_of(problem, p, config, inert, values, without=("trunk",))
+    rest = graph_of(factors_of(problem, p, config, inert, values, without=("trunk",)))
     s = problem.sightings
     keys_x, keys_l = (X + s.keyframe).tolist(), (L + problem.names()[s.tree]).tolist()
     cov = p.trunk_scale**2 * s.cov

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 
 import factors
-from topograph.estimate.generator import L, Pass, X, fix_cov, graph_of, motion_factors
+from topograph.estimate.generator import L, Pass, X, factors_of, fix_cov, graph_of, motion_factors
 from topograph.estimate.inertia import Inertia
 from topograph.estimate.problem import EstimateConfig, Offset, Problem
 from topograph.geometry import Array, inverse
@@ -24,7 +24,8 @@ def tested(
     Each is a column of one more variable in the linear system of the solution, eliminated last. What it would have to be off
     by, and how much better the residuals would be, follow without solving anew.
     """
-    g = graph_of(problem, p, config, inert, values, without=("trunk", "fix", "odometry")).linearize(values)
+    kept = factors_of(problem, p, config, inert, values, without=("trunk", "fix", "odometry"))
+    g = graph_of(kept).linearize(values)
     s, f = problem.sightings, problem.fixes
     if problem.pose_sigma is None:
         step = inverse(problem.odom_T_robot[:-1]) @ problem.odom_T_robot[1:]

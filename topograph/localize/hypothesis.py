@@ -7,6 +7,7 @@ and its crashes on re-stamped keys are known: gtsam #1452, #1935, #2567.)
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import gtsam
@@ -41,6 +42,21 @@ LEAST = 1e-10
 """Added to the variances of a step: a robot that stands has none."""
 
 
+@dataclass(slots=True)
+class _Seen:
+    """What was seen of a tree: the `last` scan that saw it, how many did, and what they told of its place together, 1/m²."""
+
+    last: int = 0
+    count: int = 0
+    information: float = 0.0
+
+    def again(self, scan: int, cov: Array) -> None:
+        """A sighting with covariance (2, 2)."""
+        self.last = scan
+        self.count += 1
+        self.information += 2.0 / float(np.trace(cov))
+
+
 class Hypothesis:
     """Where the robot is, if this place is the right one.
 
@@ -58,9 +74,7 @@ class Hypothesis:
         own = _turn(-float(pose[2])) @ cov @ _turn(-float(pose[2])).T + LEAST * np.eye(3)
         prior = gtsam.PriorFactorPose2(_X(0), gtsam.Pose2(*pose), gtsam.noiseModel.Gaussian.Covariance(own))
         self._factors: list[Any] = [prior]
-        self._last_seen: dict[int, int] = {}
-        self._noise: dict[int, float] = {}  # of its sightings together, 1/m²
-        self._counted: dict[int, int] = {}
+        self._seen: dict[int, _Seen] = {}
         self._gone = np.zeros(2)
         self.dragged = 0.0
         self.pose, self.cov = np.asarray(pose, float).copy(), np.asarray(cov, float).copy()
@@ -76,20 +90,19 @@ class Hypothesis:
         self._poses.append(self._k)
         side = self.config.trunk_sigma**2 * np.eye(2)
         for i, t in pairs.tolist():
-            if t not in self._last_seen:
+            if t not in self._seen:
+                self._seen[t] = _Seen()
                 self._values.insert(_L(t), self.trees[t])
                 sigma = float(np.sqrt(self.var[t]))
                 self._factors.append(
                     gtsam.PriorFactorPoint2(_L(t), self.trees[t], gtsam.noiseModel.Isotropic.Sigma(2, sigma))
                 )
-            self._last_seen[t] = self._k
-            self._counted[t] = self._counted.get(t, 0) + 1
-            self._noise[t] = self._noise.get(t, 0.0) + 2.0 / float(np.trace(sweep.cov[i] + side))
+            self._seen[t].again(self._k, sweep.cov[i] + side)
             self._factors.append(
                 sighting_2d(_X(self._k), _L(t), sweep.p[i], sweep.cov[i] + side, HUBER, self.config.measure)
             )
         self._solve()
-        self.dragged = self._moved(pairs[:, 1])
+        self.dragged = self._drag(pairs[:, 1])
         if len(self._poses) > LAG + OLDEST:
             self._marginalise()
 
@@ -100,7 +113,7 @@ class Hypothesis:
         order = gtsam.Ordering()
         for k in self._poses[:-1]:
             order.push_back(_X(k))
-        for t in self._last_seen:
+        for t in self._seen:
             order.push_back(_L(t))
         order.push_back(_X(self._k))  # last, so that its own conditional is its marginal
         for _ in range(STEPS):
@@ -118,36 +131,37 @@ class Hypothesis:
         by = self.dragged**2 * float(np.median(self.var))
         return Hypothesis(self.pose, self.cov + np.diag([by, by, ANEW_YAW**2]), self.trees, self.var, self.config)
 
-    def _moved(self, seen: NDArray[np.int64]) -> float:
-        """How far, in the map's own standard deviations, most of the trees that are `seen` have been moved from where the map has them."""
-        if len(seen) < 3:
-            return 0.0
-        at = np.array([self._values.atPoint2(_L(t)) for t in seen.tolist()])
-        return float(np.median(np.linalg.norm(at - self.trees[seen], axis=1) / np.sqrt(self.var[seen])))
+    def _moved(self, trees: NDArray[np.int64]) -> Array:
+        """How far `trees` (N,) have been moved from where the map has them, (N,) m."""
+        at = np.array([self._values.atPoint2(_L(t)) for t in trees.tolist()])
+        return np.asarray(np.linalg.norm(at - self.trees[trees], axis=1))
+
+    def _drag(self, seen: NDArray[np.int64]) -> float:
+        """The same of most of the trees that are `seen`, in the map's own standard deviations."""
+        return float(np.median(self._moved(seen) / np.sqrt(self.var[seen]))) if len(seen) >= 3 else 0.0
 
     def _told(self, trees: list[int]) -> Array:
         """What `trees` tell of the map's own deviation: the sum over them of its square, and how many there are.
 
         A tree of prior variance v that n sightings of variance r saw moves by v / (v + r/n) of what it is off and they err.
         """
-        t = np.array([k for k in trees if self._counted[k] >= TELLS], np.int64)
+        t = np.array([k for k in trees if self._seen[k].count >= TELLS], np.int64)
         if not len(t):
             return np.zeros(2)
-        at = np.array([self._values.atPoint2(_L(k)) for k in t.tolist()])
-        v, r = self.var[t], 1.0 / np.array([self._noise[k] for k in t.tolist()])
-        moved = np.minimum(0.5 * np.sum((at - self.trees[t]) ** 2, axis=1), OUTLIER * v)
+        v, r = self.var[t], 1.0 / np.array([self._seen[k].information for k in t.tolist()])
+        moved = np.minimum(0.5 * self._moved(t) ** 2, OUTLIER * v)
         own = v - self.config.map_sigma**2
         return np.array([float(np.sum(moved * ((v + r) / v) ** 2 - r - own)), len(t)])
 
     @property
     def scale(self) -> float:
         """Of the covariance: what is found of the map's own deviation against what was taken for it (a variance component, Förstner 1979)."""
-        total, n = self._gone + self._told(list(self._last_seen))
+        total, n = self._gone + self._told(list(self._seen))
         taken = self.config.map_sigma**2
         free = 2.0 * n / max(2.0 * n - 3.0, 1.0)  # the pose takes up what they have in common
         least, most = min(PLACE[0] ** 2, taken), max(PLACE[1] ** 2, taken)
         found = float(np.clip((TAKEN * taken + free * total) / (TAKEN + n), least, most))
-        own = float(np.mean(self.var[list(self._last_seen)])) - taken if self._last_seen else 0.0
+        own = float(np.mean(self.var[list(self._seen)])) - taken if self._seen else 0.0
         return (own + found) / (own + taken)
 
     def _marginalise(self) -> None:
@@ -157,8 +171,8 @@ class Hypothesis:
         away = self.config.view + AWAY
         gone = [
             t
-            for t, k in self._last_seen.items()
-            if k < first and float(np.hypot(*(self.trees[t] - self.pose[:2]))) > away
+            for t, seen in self._seen.items()
+            if seen.last < first and float(np.hypot(*(self.trees[t] - self.pose[:2]))) > away
         ]
         self._gone += self._told(gone)
         old |= {_L(t) for t in gone}
@@ -178,7 +192,7 @@ class Hypothesis:
         for key in old:
             self._values.erase(key)
         for t in gone:
-            del self._last_seen[t], self._counted[t], self._noise[t]
+            del self._seen[t]
         del self._poses[:OLDEST]
 
 

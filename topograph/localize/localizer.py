@@ -244,6 +244,8 @@ class GraphMethod:
         )
         self.sweep_pairs = belief.pairs
         belief = replace(belief, pairs=np.stack([rows[belief.pairs[:, 0]], belief.pairs[:, 1]], axis=1))
+        if len(belief.pairs):
+            self._common.place = SHARED**2 * float(self.engine.index.var[belief.pairs[:, 1]].min())
         self._rise(leg, belief, heights, flat)
         fix, flat_cov = None, belief.cov[:2, :2]
         if belief.pose is not None:
@@ -291,8 +293,6 @@ class GraphMethod:
         x[0] += leg.up
         drift = (0.001 if leg.level else 0.02) ** 2 * leg.distance
         P += np.diag([(0.03 * leg.distance) ** 2 + 1e-6, drift, drift])
-        if self.engine is not None and len(belief.pairs):
-            self._common.place = SHARED**2 * float(self.engine.index.var[belief.pairs[:, 1]].min())
         for i, t in belief.pairs:
             self._common.ground += 0.02 * (GROUND_SIGMA**2 + _known(self.topo.cov[t, 2, 2]) - self._common.ground)
             place = self.topo.p[t, 2] + (heights[i] if np.isfinite(heights[i]) else self.height)
@@ -314,13 +314,12 @@ class GraphMethod:
         turn[1:, 1:] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
         cov[np.ix_([5, 0, 1], [5, 0, 1])] = turn @ self._tilt_cov @ turn.T
         cov[[0, 1], [0, 1]] += 0.01**2
-        cov[[3, 4], [3, 4]] += self._slip.standing**2
-        cov[[3, 4], [3, 4]] += self._common.place
+        # Trunks that are seen so high above the base are shifted by the tilt, all alike.
+        tilt = (leg.tilt_sigma if leg.level else UNKNOWN_TILT) * self._common.above
+        cov[[3, 4], [3, 4]] += self._slip.standing**2 + self._common.place + tilt**2
         ahead = np.array([np.cos(yaw), np.sin(yaw)]) * STAMPS_S * leg.distance / max(leg.seconds, STAMPS_S)
         cov[3:5, 3:5] += np.outer(ahead, ahead)
         cov[5, 5] += self._common.ground
-        # Trunks that are seen so high above the base are shifted by the tilt, all alike.
-        cov[[3, 4], [3, 4]] += ((leg.tilt_sigma if leg.level else UNKNOWN_TILT) * self._common.above) ** 2
         return T, cov
 
 

@@ -221,10 +221,8 @@ def associate_and_solve(
         if rows is not None:
             if np.abs(made.slope[rows[0]] - former.slope[rows[1]]).max(initial=0.0) < SETTLED:
                 break
-        elif any(
-            made.like(m) is not None for m in earlier
-        ):  # a track goes to and fro between two trees, and would for ever
-            break
+        elif any(made.like(m) is not None for m in earlier):
+            break  # a track goes to and fro between two trees, and would for ever
         earlier.append(former)
     del after
     estimate = replace(graph.finish(converged, config.estimate), tree=decided.tree)

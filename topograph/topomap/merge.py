@@ -36,7 +36,7 @@ def merge(
         a[taken] = b[tree_of_old[taken]]
         return np.concatenate([a, b[fresh]])
 
-    surer = seen & ~_surer(old, new, tree_of_old)
+    no_worse = seen & ~_surer(old, new, tree_of_old)
 
     p = both("p")
     sightings = np.concatenate([old.sightings, new.sightings[fresh]])
@@ -74,10 +74,10 @@ def merge(
         datum=old.datum,
         ids=ids.astype(np.int64),
         p=p,
-        cov=both("cov", surer),
+        cov=both("cov", no_worse),
         axis=both("axis"),
-        lean_sigma=both("lean_sigma", surer),
-        known_at=both("known_at", surer),
+        lean_sigma=both("lean_sigma", no_worse),
+        known_at=both("known_at", no_worse),
         diameter=both("diameter"),
         first_branch=both("first_branch"),
         sightings=sightings,

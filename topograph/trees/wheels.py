@@ -40,15 +40,16 @@ def with_trunks_way(motion: Motion, d: Detections, fix_ns: Stamps) -> Motion:
         return motion
     odom_T_robot = motion.at(d.stamps_ns)
     scans_ns = np.column_stack([d.stamps_ns[:-1], d.stamps_ns[1:]])
-    asked = _with_neighbours(~_near(fix_ns, scans_ns), d.stamps_ns)
-    ns, legs = _legs(odom_T_robot, d, asked)
+    near = _near(fix_ns, scans_ns)
+    asked = _with_neighbours(~near, d.stamps_ns)
+    rows, legs = _legs(odom_T_robot, d, asked)
     if len(legs) < LEGS:
         return motion
-    slipping = _slipping(ns, legs) & ~_near(fix_ns, ns)
+    ns = scans_ns[rows]
+    slipping = _slipping(ns, legs) & ~near[rows]
     driven = np.linalg.norm(np.diff(odom_T_robot[:, :2, 3], axis=0), axis=1) > 0.01
-    told = (
-        driven.sum() * len(legs) / asked.sum()
-    )  # of all that was driven, as much as trunks tell of where they are asked
+    # Of all that was driven, as much as trunks tell of where they are asked.
+    told = driven.sum() * len(legs) / asked.sum()
     if not slipping.any() or slipping.sum() > MOST * max(told, 1.0):
         return motion
     return _corrected(motion, ns, legs, slipping)
@@ -65,7 +66,7 @@ def _with_neighbours(asked: NDArray[np.bool_], scans_ns: Stamps) -> NDArray[np.b
 
 
 def _legs(odom_T_robot: Array, d: Detections, asked: NDArray[np.bool_]) -> tuple[NDArray[np.int64], Array]:
-    """From and to (L, 2), ns, of the legs between scans that are `asked` for (S-1,), and (L, 5): what the trunks add to the leg (x, y, m, in
+    """Rows (L,) of the legs between scans that trunks tell of, among those `asked` for (S-1,), and (L, 5): what the trunks add to the leg (x, y, m, in
     the robot's frame), its way (x, y, m), their sigma."""
     up = planar(odom_T_robot[:, 0, 3], odom_T_robot[:, 1, 3], yaw_of(odom_T_robot))
     up[:, 2, 3] = odom_T_robot[:, 2, 3]
@@ -75,7 +76,7 @@ def _legs(odom_T_robot: Array, d: Detections, asked: NDArray[np.bool_]) -> tuple
     rows = np.flatnonzero(use)[order]
     ends = np.searchsorted(d.scan[rows], np.arange(len(d.stamps_ns) + 1))
     yaw = yaw_of(odom_T_robot)
-    spans, legs = [], []
+    told, legs = [], []
     for a in np.flatnonzero(asked).tolist():
         b = a + 1
         if not 0 < d.stamps_ns[b] - d.stamps_ns[a] < GAP_NS:
@@ -86,9 +87,9 @@ def _legs(odom_T_robot: Array, d: Detections, asked: NDArray[np.bool_]) -> tuple
         step = np.array([c * way[0] + s * way[1], -s * way[0] + c * way[1], yaw[b] - yaw[a]])
         found = between(last, now, Leg(step=step, distance=0.0, turned=0.0, seconds=0.0))
         if found is not None and min(len(last), len(now)) >= WITNESSES:
-            spans.append((d.stamps_ns[a], d.stamps_ns[b]))
+            told.append(a)
             legs.append((*found[0][:2], *step[:2], found[1][0]))
-    return np.array(spans, np.int64).reshape(-1, 2), np.array(legs).reshape(-1, 5)
+    return np.array(told, np.int64), np.array(legs).reshape(-1, 5)
 
 
 def _near(fix_ns: Stamps, ns: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import gtsam
@@ -22,8 +23,8 @@ def to_pose3(pose: ArrayLike) -> Any:
     return gtsam.Pose3(gtsam.Rot3(R), T[:3, 3])
 
 
-def to_pose3s(poses: NDArray[np.float64]) -> list[Any]:
-    """gtsam.Pose3 of matrices (N, 4, 4), checked in bulk.
+def to_pose3s(poses: NDArray[np.float64]) -> Iterator[Any]:
+    """gtsam.Pose3 of matrices (N, 4, 4), checked in bulk, one by one: as Python's objects they are large.
 
     Raises:
         ValueError: as `to_pose3`.
@@ -33,7 +34,7 @@ def to_pose3s(poses: NDArray[np.float64]) -> list[Any]:
         raise ValueError("not rigid motions")
     if len(R) and np.linalg.det(R).min() < 0:
         raise ValueError("not rigid motions")
-    return [gtsam.Pose3(gtsam.Rot3(a), b) for a, b in zip(R, t, strict=True)]
+    return (gtsam.Pose3(gtsam.Rot3(a), b) for a, b in zip(R, t, strict=True))
 
 
 def from_pose3(pose: Any) -> NDArray[np.float64]:

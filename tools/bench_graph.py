@@ -1,7 +1,7 @@
 """What the graph of a long run costs: time and memory by keyframes; python tools/bench_graph.py [--keyframes 10000 30000 100000]
 
 A path to and fro between rows of trees 5 m apart, half a metre between keyframes, eight sightings each, RTK at every fifth. Each size in a process of
-its own, so that its peak is its own; the floor is what the problem's arrays hold.
+its own, so that its peak is its own, with the memory settings of the command line; the floor is what the problem's arrays hold.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import time
 import numpy as np
 from scipy.spatial import cKDTree
 
+from topograph.cli.common import thrifty
 from topograph.estimate import EstimateConfig, Fixes, Headings, Problem, graph
 from topograph.geometry import Datum, inverse, planar, transform
 from topograph.motion import Motion, MotionConfig
@@ -73,6 +74,7 @@ def peak() -> float:
 
 def one(n: int) -> None:
     """Solve one size and print its line."""
+    thrifty()
     p = problem(n)
     floor, began = peak(), time.process_time()
     e = graph.solve(p, EstimateConfig())

@@ -89,7 +89,7 @@ LARGE, KEPT = 4 << 20, 32 << 20
 """Bytes from which on an array has pages of its own; what stays with the heap when it is freed, for the next sweep."""
 
 
-def _thrifty() -> None:
+def thrifty() -> None:
     """glibc keeps a heap for each thread, and what a solver's thread has freed is never given to the others; and it learns to put arrays
     of up to 32 MB on the heap, where they leave holes: together a sixth of the peak.
     """
@@ -105,7 +105,7 @@ def _thrifty() -> None:
 @click.option("-v", "--verbose", is_flag=True, help="Say what happens inside.")
 def main(verbose: bool) -> None:
     """Topological maps of orchards from robot recordings, by factor graph."""
-    _thrifty()
+    thrifty()
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _end)
     logging.basicConfig(level=logging.WARNING if verbose else logging.ERROR, format="%(name)s: %(message)s")

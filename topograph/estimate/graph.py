@@ -177,6 +177,8 @@ def _nearest(s: Sightings, most: int) -> Sightings:
     rank_in_tree = np.empty(len(s), np.int64)
     rank_in_tree[by_tree] = np.arange(len(s)) - np.searchsorted(tree, tree, side="left")
     keep = (rank < most) | (rank_in_tree < 2)
+    if keep.all():  # no copy of what a long run holds most of
+        return s
     return Sightings(
         keyframe=s.keyframe[keep],
         tree=s.tree[keep],

@@ -25,6 +25,7 @@ from topograph.trunks.fit import (
 from topograph.trunks.passage import (
     AXIS_HIT,
     AXIS_PASS,
+    BINS,
     CROWN_HIT,
     CROWN_SEEN,
     SEEN_SIZE,
@@ -35,7 +36,7 @@ from topograph.trunks.passage import (
     crossings,
     look_at,
 )
-from topograph.trunks.patch import HIGH_NAMES, PATCH_NAMES, PATCH_SIZE, look_at_patch
+from topograph.trunks.patch import BEAMS, HIGH_NAMES, PATCH_NAMES, PATCH_SIZE, look_at_patch
 from topograph.trunks.runs import FIRST, FREE, LAST, RANGE, RING, WIDTH, look_around
 
 FEATURES = (
@@ -67,7 +68,10 @@ BEHIND = 0.25
 def describe(p, r, runs, label, order, ends, fits, name, near, tangent, R, eye, above, beside, up, step):
     """Features (C, len(FEATURES)) of the trunks `fits` (C, OUT_SIZE)."""
     out = np.zeros((len(fits), _COUNT))
-    crossed = np.empty((len(tangent), 4))
+    crossed = np.empty((4, len(tangent)), np.float32)
+    slopes = tangent.astype(np.float32)
+    around = np.concatenate((near[:, BINS - BEAMS :], near, near[:, :BEAMS]), axis=1)
+    work = np.empty((2, BEAMS), np.int32)
     for c in range(len(fits)):
         a, f = fits[c], out[c]
         mine = order[ends[name[c]] : ends[name[c] + 1]]
@@ -81,9 +85,9 @@ def describe(p, r, runs, label, order, ends, fits, name, near, tangent, R, eye, 
         _ladder(runs, mine, highest - lowest, f)
         _surface(p, r, runs, label, mine, a, lx, ly, radius, f)
         _around(above, beside, a, lx, ly, radius, f)
-        if crossings(tangent, R, eye, a[X], a[Y], a[Z], lx, ly, crossed):
+        if crossings(slopes, R, eye, a[X], a[Y], a[Z], lx, ly, crossed):
             _beams(near, crossed, a[Z] - a[ABOVE], radius, highest, f)
-            look_at_patch(near, crossed, a[Z] - a[ABOVE], radius, f[_PATCH:])
+            look_at_patch(around, crossed, a[Z] - a[ABOVE], radius, work, f[_PATCH:])
         else:
             f[_TRUNK_PASSED] = -1.0  # rings that run along columns tell nothing: outside of what was trained on
     return out

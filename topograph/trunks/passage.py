@@ -167,25 +167,34 @@ TRUNK_HIT, TRUNK_PASS, TRUNK_RINGS, AXIS_HIT, AXIS_PASS, CROWN_HIT, CROWN_SEEN, 
 SEEN_SIZE = 8
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def crossings(tangent, R, eye, x, y, z, lx, ly, out):
-    """Height (m), horizontal distance from the sensor (m), direction (x, y) of the places (rings, 4) `out` where the rings cross a
-    column through (x, y, z) with slope (lx, ly); False where rings run along it.
+    """Height (m), horizontal distance from the sensor (m), direction (x, y) of the places (4, rings) `out`, in single precision, where the
+    rings, of tangents of elevation `tangent` (rings,), cross a column through (x, y, z) with slope (lx, ly); False where rings run along it.
 
     A ring is a cone about the sensor's axis: where it crosses the column is found by three steps of a fixed point.
     """
-    ax, ay, az = R[0, 2], R[1, 2], R[2, 2]
-    if abs(az) < 0.3:
+    if abs(R[2, 2]) < 0.3:
         return False
-    for k in range(len(tangent)):
-        zk = z
-        for _ in range(3):
-            dx, dy, dz = x + lx * (zk - z) - eye[0], y + ly * (zk - z) - eye[1], zk - eye[2]
+    ax, ay, az = np.float32(R[0, 2]), np.float32(R[1, 2]), np.float32(R[2, 2])
+    x0, y0, z0 = np.float32(x - eye[0]), np.float32(y - eye[1]), np.float32(z - eye[2])
+    mx, my = np.float32(lx), np.float32(ly)
+    far, least = np.float32(8.0), np.float32(1e-6)
+    height, distance, across, along = out[0], out[1], out[2], out[3]
+    n = tangent.shape[0]
+    for k in range(n):
+        height[k] = np.float32(0.0)  # above z, until the end
+    for _ in range(3):  # all rings at once
+        for k in range(n):
+            rise = height[k]
+            dx, dy, dz = x0 + mx * rise, y0 + my * rise, z0 + rise
             up = ax * dx + ay * dy + az * dz
-            flat = np.sqrt(max(dx * dx + dy * dy + dz * dz - up * up, 1e-6))
-            zk = min(max(zk + (tangent[k] * flat - up) / az, z - 8.0), z + 8.0)
-        dx, dy = x + lx * (zk - z) - eye[0], y + ly * (zk - z) - eye[1]
-        out[k, 0], out[k, 1], out[k, 2], out[k, 3] = zk, np.sqrt(dx * dx + dy * dy), dx, dy
+            flat = np.sqrt(max(dx * dx + dy * dy + dz * dz - up * up, least))
+            height[k] = min(max(rise + (tangent[k] * flat - up) / az, -far), far)
+    for k in range(n):
+        dx, dy = x0 + mx * height[k], y0 + my * height[k]
+        distance[k], across[k], along[k] = np.sqrt(dx * dx + dy * dy), dx, dy
+        height[k] += np.float32(z)
     return True
 
 
@@ -195,7 +204,7 @@ CROWN_STEP = 0.08
 
 @njit(cache=True, error_model="numpy")
 def look_at(near, crossed, ground, radius, highest, out):
-    """What the rings say of a column that they cross as in `crossed` (rings, 4): (SEEN_SIZE,) `out`.
+    """What the rings say of a column that they cross as in `crossed` (4, rings): (SEEN_SIZE,) `out`.
 
     At 0.3-1.7 m: rings that met it, passed it, crossed it. At 1.9-4.5 m: rings that met its axis or passed it; the share of
     directions within 1 m that met something at its range, and how many were looked at. TOP is 1 where the next rings
@@ -205,11 +214,11 @@ def look_at(near, crossed, ground, radius, highest, out):
     above = 0.0
     tops = 0
     for k in range(near.shape[0]):
-        h = crossed[k, 0] - ground
+        h = crossed[0, k] - ground
         if h < 0.3 or h > 4.5 or (1.7 < h < 1.9):
             continue
-        d = crossed[k, 1]
-        b = bin_of(crossed[k, 2], crossed[k, 3])
+        d = crossed[1, k]
+        b = bin_of(crossed[2, k], crossed[3, k])
         width = d * (4.0 / BINS) * 1.2  # of a bin, about
         reach = max(int(0.6 * radius / max(width, 1e-3)), 0)
         tolerance = 0.25 + radius + 0.01 * d

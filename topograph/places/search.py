@@ -74,8 +74,8 @@ def spread(m: Array, cov: Array) -> Array:
 
 ANYWHERE = Prior(np.zeros(3), np.zeros((2, 2)), 1e12)
 """Nothing is known of the place beforehand."""
-SLICE = 8_000
-"""Pairs of trees that are tried at once while tracking: some ten milliseconds."""
+SLICE = 4_000
+"""Pairs of trees that are tried at once while tracking: some five milliseconds."""
 MOST_ANCHORS = 12
 """Pairs of landmarks that a search begins with."""
 FEWER = 40

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from topograph.bags import Trunks
-from topograph.geometry import Array, from_xyz_rpy, transform
+from topograph.geometry import Array, from_xyz_rpy, transform, wrap
 from topograph.localize.method import Fix, Report
 from topograph.motion import Leg
 from topograph.ranges import Count, NonNegative, Positive
@@ -237,12 +237,12 @@ class ThesisMethod:
         tree = cKDTree(z[:, :2]) if len(z) else None
         for k in range(len(poses)):
             near = tree.query_ball_point(poses[k, :2], c.gate) if tree is not None else []
-            near = [i for i in sorted(near) if abs(_turned(z[i, 2] - poses[k, 2])) < c.gate_yaw]
+            near = [i for i in sorted(near) if abs(wrap(z[i, 2] - poses[k, 2])) < c.gate_yaw]
             if not near:
                 counts[k] += driven if c.count_distance else 1
                 continue
             chosen = near[0] if c.first else min(near, key=lambda i: float(np.hypot(*(z[i, :2] - poses[k, :2]))))
-            away = _turned(z[chosen, 2] - poses[k, 2])
+            away = wrap(z[chosen, 2] - poses[k, 2])
             poses[k] = [*(0.5 * (poses[k, :2] + z[chosen, :2])), poses[k, 2] + 0.5 * away]  # eq. 4.18
             by[k] = measured.nodes[chosen]
             if c.reset:
@@ -283,10 +283,6 @@ def _moved(poses: Array, leg: Leg) -> Array:
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     dx, dy, turn = leg.step
     return np.asarray(poses + np.stack([c * dx - s * dy, s * dx + c * dy, np.full(len(poses), turn)], axis=1))
-
-
-def _turned(angle: float) -> float:
-    return float((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
 def multilaterate(z: Array, beacons: Array, steps: int = 100) -> Array:

@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 
-from topograph.geometry import Array
+from topograph.geometry import Array, wrap
 
 BLOCK_S, BLOCKS, FEW = 1.0, 20, 4
 """Motion is compared over stretches of this length, the last so many, at least so few."""
@@ -73,7 +73,7 @@ class Against:
     def _close(self, pose: Array | None) -> None:
         turn = float("nan")
         if self._begin is not None and pose is not None:
-            turn = (pose[2] - self._begin[2] + np.pi) % (2 * np.pi) - np.pi
+            turn = float(wrap(pose[2] - self._begin[2]))
             self._learn_scale(float(np.hypot(*(pose[:2] - self._begin[:2]))), float(np.hypot(*self._open[3:5])))
         self._blocks.append((float(self._open[0]), float(self._open[1]), turn))
         self._lengths.append(float(self._open[2]))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from topograph.bags import Imu, Odometry
-from topograph.geometry import Array, exp, from_quaternion, inverse, log
+from topograph.geometry import Array, exp, from_quaternion, inverse, log, wrap
 from topograph.motion.against import Against
 from topograph.motion.gravity_kernel import gravity_kernel
 from topograph.motion.inertial import GRAVITY
@@ -240,7 +240,7 @@ class Reckoner:
         F = np.array([[1.0, dt], [0.0, 1.0]])
         P = F @ self._drift_cov @ F.T + np.diag([HEADING_WALK**2, BIAS_WALK**2]) * dt
         x = F @ self._drift
-        off = (yaw - self._told - x[0] + np.pi) % (2 * np.pi) - np.pi
+        off = float(wrap(yaw - self._told - x[0]))
         S = P[0, 0] + sigma**2
         if off**2 > 25.0 * S:  # found again elsewhere
             x[0], P = x[0] + off, np.diag([sigma**2, P[1, 1]])

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from topograph.geometry import Array, inverse, transform
+from topograph.geometry import Array, inverse, transform, wrap
 from topograph.simulate.orchard import Orchard
 
 
@@ -34,7 +34,7 @@ def detect(
     for i in np.argsort(far):
         if far[i] > noise.view or far[i] < 0.7 or rng.random() < noise.miss:
             continue
-        hidden = [j for j in keep if abs((bearing[i] - bearing[j] + np.pi) % (2 * np.pi) - np.pi) < half[j]]
+        hidden = [j for j in keep if abs(wrap(bearing[i] - bearing[j])) < half[j]]
         if not hidden:
             keep.append(int(i))
     sigma = noise.sigma + noise.growth * far[keep]

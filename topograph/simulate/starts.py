@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from topograph.geometry import Array
+from topograph.geometry import Array, wrap
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +180,7 @@ def _steer(pose: Array, goal: Array, tree: cKDTree, rng: np.random.Generator) ->
         side = np.cos(pose[2]) * d[1] - np.sin(pose[2]) * d[0]
         return -0.8 if side > 0 else 0.8
     to = np.arctan2(goal[1] - pose[1], goal[0] - pose[0])
-    turn = (to - pose[2] + np.pi) % (2 * np.pi) - np.pi
+    turn = float(wrap(to - pose[2]))
     return float(np.clip(0.5 * turn, -0.4, 0.4) + rng.normal(0, 0.05))
 
 
@@ -194,7 +194,7 @@ def _scan(
     reach, bearing = np.hypot(p[:, 0], p[:, 1]), np.arctan2(p[:, 1], p[:, 0])
     order = np.argsort(reach)
     half = 0.5 * w.diameters[rows] / np.maximum(reach, 0.5)
-    apart = np.abs((bearing[order, None] - bearing[None, order] + np.pi) % (2 * np.pi) - np.pi)
+    apart = np.abs(wrap(bearing[order, None] - bearing[None, order]))
     hidden = np.tril(apart < half[None, order], -1).any(axis=1)
     keep = order[~hidden & (rng.random(len(order)) >= c.miss)]
     n = len(keep)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from topograph.geometry import Array, inverse, transform
+from topograph.geometry import Array, inverse, transform, wrap
 from topograph.session import SECTORS
 from topograph.trees.detections import Detections
 from topograph.trees.robust import weighted_median
@@ -260,6 +260,6 @@ def _hidden(scan: NDArray[np.int64], far: Array, bearing: Array) -> NDArray[np.b
     for rows in np.split(np.arange(len(scan)), ends):
         rows = rows[far[rows] < 60.0]
         b, r = bearing[rows], far[rows]
-        d = np.abs((b[:, None] - b[None] + np.pi) % (2 * np.pi) - np.pi)
+        d = np.abs(wrap(b[:, None] - b[None]))
         hidden[rows] = ((r[None] < r[:, None] - 1.0) & (d * r[None] < 0.25)).any(axis=1)
     return hidden

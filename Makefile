@@ -27,7 +27,7 @@ package: $(STAMP)
 	$(BIN)/python tools/package.py --oldest
 
 bench: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev,bench]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]'
 	$(BIN)/python tools/bench.py
 
 evaluate: $(STAMP)

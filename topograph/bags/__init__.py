@@ -5,7 +5,7 @@ The only room that knows ROS. `Recording` is the door; `BagWriter` is the way ba
 
 from topograph.bags.config import BagsConfig
 from topograph.bags.messages import Fix, Heading, Imu, Odometry, Trunks
-from topograph.bags.recording import DAMAGED, EMPTY, INFINITE, UNDECODED, Recording
+from topograph.bags.recording import DAMAGED, EMPTY, INFINITE, UNDECODED, Product, Recording
 from topograph.bags.scan import Scan
 from topograph.bags.scan import decode as decode_scan
 from topograph.bags.survey import StreamSurvey, Survey, survey
@@ -20,6 +20,7 @@ __all__ = [
     "Heading",
     "Imu",
     "Odometry",
+    "Product",
     "Recording",
     "Scan",
     "StreamSurvey",

@@ -11,7 +11,7 @@ class BagsConfig:
 
     Attributes:
         topic_points, topic_trunks, topic_odometry, topic_imu, topic_fix, topic_heading: topic of the stream; "" finds it by its type,
-            "none" ignores the stream.
+            "none" ignores the stream; `topic_odometry: lidar` takes the motion from the point clouds (KISS-ICP).
         base_frame: the frame whose poses are estimated.
         extrinsics: frame -> (x, y, z, roll, pitch, yaw) of the sensor in `base_frame`, metres and radians;
             overrules TF.

@@ -82,6 +82,11 @@ class Recording:
         self._readers: list[Reader] = []
         self._stack = ExitStack()
 
+    @property
+    def moved_by_lidar(self) -> bool:
+        """Whether the motion is to come from the point clouds."""
+        return self.config.topic_odometry == topics.FROM_LIDAR and "points" in self.chosen
+
     def __enter__(self) -> Self:
         try:
             self._open_all()

@@ -22,6 +22,10 @@ KINDS: dict[str, tuple[str, ...]] = {
 }
 
 
+FROM_LIDAR = "lidar"
+"""In place of odometry's topic: the motion is that of the point clouds."""
+
+
 def choose(types: Mapping[str, str], config: BagsConfig) -> dict[str, str]:
     """Stream kind -> topic, of the topics -> types of a recording. Kinds without a topic are left out.
 
@@ -31,7 +35,7 @@ def choose(types: Mapping[str, str], config: BagsConfig) -> dict[str, str]:
     chosen: dict[str, str] = {}
     for kind, accepted in KINDS.items():
         wanted = getattr(config, f"topic_{kind}")
-        if wanted == "none":
+        if wanted == "none" or (kind == "odometry" and wanted == FROM_LIDAR):
             continue
         if wanted:
             chosen[kind] = _named(kind, wanted, accepted, types)

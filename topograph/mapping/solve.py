@@ -137,7 +137,7 @@ def prepare(
     if motion is None:
         raise InsufficientDataError(
             "no wheel odometry and fewer than ten usable fixes: the distance between scans is unknown; "
-            "name them with --topic-odometry or --topic-fix"
+            "name them with --topic-odometry or --topic-fix, or take the motion from the point clouds with --topic-odometry lidar"
         )
     if not motion.wheels:
         notes.append("no wheel odometry: the motion between poses rests on GNSS fixes, IMU and trunks")

@@ -1,6 +1,7 @@
 """Odometry + Imu -> Motion: where dead reckoning says the robot is, at any stamp. No map, no trunks."""
 
 from topograph.motion.inertial import Inertial, align_imu, mount_turn
+from topograph.motion.lidar import LidarOdometry
 from topograph.motion.online import Leg, Reckoner
 from topograph.motion.recent import RecentMotion
 from topograph.motion.reckon import Motion, MotionConfig, dead_reckon
@@ -9,6 +10,7 @@ from topograph.motion.samples import in_radians, without_nonsense
 __all__ = [
     "Inertial",
     "Leg",
+    "LidarOdometry",
     "Motion",
     "MotionConfig",
     "RecentMotion",

@@ -71,8 +71,10 @@ def localize_bags(
         for kind in ("fix", "heading"):
             recording.chosen.pop(kind, None)
         out.chosen, out.duration_s, out.skipped = dict(recording.chosen), recording.duration_s, recording.skipped
-        if "odometry" not in recording.chosen:
-            raise InsufficientDataError("localization needs wheel odometry; name it with --topic-odometry")
+        if "odometry" not in recording.chosen and not recording.moved_by_lidar:
+            raise InsufficientDataError(
+                "localization needs wheel odometry: name it with --topic-odometry, or take the motion from the point clouds with --topic-odometry lidar"
+            )
         if not {"points", "trunks"} & set(recording.chosen):
             raise InsufficientDataError(
                 "no point cloud and no trunk detections; name one with --topic-points or --topic-trunks"

@@ -15,11 +15,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from topograph.bags import DAMAGED, EMPTY, INFINITE, UNDECODED, Fix, Heading, Imu, Odometry, Recording, Scan, Trunks
+from topograph.bags import (
+    DAMAGED,
+    EMPTY,
+    INFINITE,
+    UNDECODED,
+    Fix,
+    Heading,
+    Imu,
+    Odometry,
+    Product,
+    Recording,
+    Scan,
+    Trunks,
+)
 from topograph.config import Config
 from topograph.errors import InputError
 from topograph.geometry import Array, inverse
 from topograph.mapping import Progress, silent
+from topograph.motion import LidarOdometry
 from topograph.session import Scans, ScansBuilder, Session, Streams, StreamsBuilder, unknown_mounts
 from topograph.trunks import from_recorded
 
@@ -42,7 +56,9 @@ def stream(
     pending: list[tuple[int, Scan]] = []
     seen: set[int] = set()
     expected = max(1, sum(recording.counts[t] for t in recording.chosen.values()))
-    for n, (kind, product) in enumerate(recording.messages(window_ns=_window(recording, span_s))):
+    for n, (kind, product) in enumerate(
+        _moved(recording, config, recording.messages(window_ns=_window(recording, span_s)))
+    ):
         if n % 200 == 0:
             progress("read", n / expected)
         if isinstance(product, (Scan, Trunks)):
@@ -64,6 +80,21 @@ def stream(
         yield from _careful(front_end, scan, recording.skipped)
     recording.untimed += front_end.untimed
     progress("read", 1.0)
+
+
+def _moved(
+    recording: Recording, config: Config, messages: Iterator[tuple[str, Product]]
+) -> Iterator[tuple[str, Product]]:
+    """The messages, with the motion that the point clouds tell before each of them where wheels are not to."""
+    if not recording.moved_by_lidar:
+        yield from messages
+        return
+    odometry = LidarOdometry(recording.frames.get, config.bags.base_frame)
+    for kind, product in messages:
+        step = odometry.step(product) if isinstance(product, Scan) else None
+        if step is not None:
+            yield "odometry", step
+        yield kind, product
 
 
 BROKE = "the front end failed on it"
@@ -132,7 +163,7 @@ def read_run(
     notes: list[str] = []
     with Recording(paths, config.bags) as recording:
         builder = StreamsBuilder()
-        if jobs > 1 and "points" in recording.chosen and span_s == WHOLE:
+        if jobs > 1 and "points" in recording.chosen and span_s == WHOLE and not recording.moved_by_lidar:
             found = _in_parts(recording, config, jobs, builder, progress)
             if found is None:
                 return read_run(paths, config, progress, span_s)

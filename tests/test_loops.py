@@ -290,7 +290,8 @@ def walked(jitter: float, drifted: Array) -> tuple[LoopCloser, Array]:
     n = len(x)
     place = np.column_stack([x, y])
     table = TrackTable(
-        place=place, foot=place, width=np.zeros(n), post=np.zeros(n), sigma=np.full(n, 0.05), first=first, last=last, hits=hits.astype(np.int64)
+        place=place, foot=place, width=np.zeros(n), post=np.zeros(n), sigma=np.full(n, 0.05), first=first, last=last, hits=hits.astype(np.int64),
+        known=np.zeros(n, bool), single=np.zeros(n, bool),
     )  # fmt: skip
     closer = LoopCloser(n, motion_of(distance, gyro=False), TreesConfig(), MotionConfig())
     while closer.advance(table, Way(distance=distance, pose=pose), float(distance[-1]), 1e6):

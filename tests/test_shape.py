@@ -138,7 +138,7 @@ def test_pieces_of_a_thick_trunk_do_not_go_to_and_fro(apart: float, widths: tupl
         at = np.column_stack([apart * face, 0.0 * face]) + rng.normal(0, 0.03, (n, 2))
         table = TrackTable(
             place=at, foot=at, width=np.array(widths)[face], post=np.full(n, -3.0), sigma=rng.uniform(0.01, 0.03, n),
-            first=np.zeros(n), last=np.ones(n), hits=rng.integers(3, 400, n),
+            first=np.zeros(n), last=np.ones(n), hits=rng.integers(3, 400, n), known=np.zeros(n, bool), single=np.zeros(n, bool),
         )  # fmt: skip
         tree = refine(table, np.arange(n), TreesConfig())
         trees = []

@@ -78,11 +78,12 @@ class Headings:
 @dataclass(frozen=True, slots=True)
 class KnownTrees:
     """Trees of an earlier map: landmarks (Q, 3) in the same frame, covariances (Q, 3, 3), and which tree of
-    `sightings` each one is, (Q,), -1 where it was not seen."""
+    `sightings` each one is, (Q,), -1 where it was not seen; `single` (Q,) where it has one stem."""
 
     p: Array
     cov: Array
     tree: NDArray[np.int64]
+    single: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

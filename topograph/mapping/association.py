@@ -82,6 +82,8 @@ class Association:
             first=np.concatenate([t.first, long_ago]),
             last=np.concatenate([t.last, long_ago]),
             hits=np.concatenate([t.hits, np.full(self.known, 1000)]),
+            known=np.concatenate([t.known, np.ones(self.known, bool)]),
+            single=np.concatenate([t.single, k.single]),
         )
 
     def way(self, e: Estimate) -> Way:

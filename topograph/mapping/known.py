@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from topograph.estimate import Fixes, Headings, KnownTrees, Problem
 from topograph.geometry import Array, Datum, Stamps, above_ground, inverse, transform, yaw_of
@@ -18,13 +19,14 @@ UNKNOWN = 1.0
 @dataclass(frozen=True, slots=True)
 class KnownMap:
     """Feet (Q, 3) of the trees of a map, m, their covariances (Q, 3, 3), their axes (Q, 3), how well and where these are known (Q,) (see
-    `geometry.above_ground`), and the map's datum."""
+    `geometry.above_ground`), their stems (Q,), and the map's datum."""
 
     p: Array
     cov: Array
     axis: Array
     lean_sigma: Array
     known_at: Array
+    stems: NDArray[np.int64]
     datum: Datum | None
 
     def at(self, detections: Detections) -> KnownTrees:
@@ -35,7 +37,7 @@ class KnownMap:
         cov = np.where(unknown, UNKNOWN * np.eye(3), self.cov)
         p, cov = above_ground(self.p, cov, self.axis, self.lean_sigma, self.known_at, height)
         cov[:, [0, 1, 2], [0, 1, 2]] = np.maximum(cov[:, [0, 1, 2], [0, 1, 2]], 1e-5)
-        return KnownTrees(p, cov, np.full(len(p), -1, np.int64))
+        return KnownTrees(p, cov, np.full(len(p), -1, np.int64), self.stems == 1)
 
 
 SIGMA, SIGMA_YAW = 0.5, 0.1

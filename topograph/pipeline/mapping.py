@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from topograph.config import Config
@@ -23,7 +25,7 @@ from topograph.mapping import (
 from topograph.session import Session
 from topograph.topomap import SessionRecord, TopoMap, build, merge
 from topograph.topomap.map import TREE
-from topograph.trees import Existence, seen_through, shapes
+from topograph.trees import Existence, overdue, seen_through, shapes
 
 
 def solve_run(
@@ -49,7 +51,7 @@ def mapping_config(config: Config) -> MappingConfig:
 
 def known_map(topo: TopoMap) -> KnownMap:
     """What the loop needs of a map."""
-    return KnownMap(topo.p, topo.cov, topo.axis, topo.lean_sigma, topo.known_at, topo.datum)
+    return KnownMap(topo.p, topo.cov, topo.axis, topo.lean_sigma, topo.known_at, topo.stems, topo.datum)
 
 
 def why_no_trees(solved: Solved) -> str:
@@ -177,5 +179,11 @@ def extend(old: TopoMap, new: TopoMap, solved: Solved, config: Config) -> TopoMa
     """The old map with a further run in it: trees seen again are updated, the others kept, new ones added."""
     known = solved.problem.known
     assert known is not None
-    passed = seen_through(solved.detections, map_T_scans(solved), known.p)
-    return merge(old, new, known.tree, config.topomap, passed)
+    T, d, trees = map_T_scans(solved), solved.detections, solved.estimate.trees
+    absent = known.tree < 0
+    lacking = overdue(d, solved.estimate.tree, T, np.concatenate([trees, known.p[absent]]))
+    passed = seen_through(d, T, known.p)
+    passed[absent] = np.maximum(passed[absent], lacking[len(trees) :])
+    lacking[np.setdiff1d(np.arange(len(trees)), known.tree)] = 0  # what is new cannot be gone
+    seen = replace(new.seen, passed=np.maximum(new.seen.passed, lacking[new.seen.tree]))
+    return merge(old, replace(new, seen=seen), known.tree, config.topomap, passed)

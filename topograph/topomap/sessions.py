@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 STANDING, MISSING = "standing", "missing"
 MOST_PASSED = 6
-"""Scans of a session that saw through a tree's place, and none that saw it: it is missing."""
+"""Scans of a session that saw through a tree's place, or ought to have shown it, and none that saw it: it is missing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +39,7 @@ class Seen:
     Attributes:
         tree, session: (R,) rows of the map's trees and sessions.
         count: (R,) sightings; `first_ns`, `last_ns` (R,) stamps of the first and the last one, 0 without any.
-        passed: (R,) scans that saw through its place.
+        passed: (R,) scans that saw through its place, or, where it was not seen, that should have shown it.
     """
 
     tree: NDArray[np.int64]

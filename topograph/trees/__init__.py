@@ -2,7 +2,7 @@
 
 from topograph.trees.detections import Detections
 from topograph.trees.drift import ASTRAY, SPAN, Way, astray, deviation, drift
-from topograph.trees.existence import Existence, exists, seen_through
+from topograph.trees.existence import Existence, exists, overdue, seen_through
 from topograph.trees.foot import grounds
 from topograph.trees.keyframes import choose_keyframes
 from topograph.trees.loops import Closed, LoopCloser, Loops, TrackTable, moved_pose, tabulate
@@ -40,6 +40,7 @@ __all__ = [
     "gather",
     "grounds",
     "moved_pose",
+    "overdue",
     "refine",
     "relevelled",
     "screen",

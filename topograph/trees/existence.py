@@ -236,13 +236,7 @@ def _shown_often(
     n: int, config: TreesConfig,
 ) -> NDArray[np.bool_]:  # fmt: skip
     """Trees (n,) that enough of the scans showed that should have: where the chance is high and nothing stands before."""
-    far, bearing = np.hypot(p[:, 0], p[:, 1]), np.arctan2(p[:, 1], p[:, 0])
-    sure = (hits >= max(8.0, float(np.median(hits)) if len(hits) else 0.0))[which]
-    cell = np.minimum((far / 5.0).astype(int), 19) * 18 + ((bearing + np.pi) / (2 * np.pi) * 18).astype(int) % 18
-    total = np.bincount(cell[sure], minlength=360)
-    shown = np.bincount(cell[sure], seen[sure].astype(float), minlength=360)
-    chance = ((shown + 0.1) / (total + 1.0))[cell]
-    open_to = ~_hidden(scan, far, bearing)
+    chance, open_to = _chance(scan, which, p, seen, hits)
     expected = (chance > 0.35) & open_to
     asked = np.bincount(which[expected], minlength=n)
     found = np.bincount(which[expected & seen], minlength=n)
@@ -251,6 +245,40 @@ def _shown_often(
     due = np.bincount(which[open_to], chance[open_to], n)
     came = np.bincount(which[open_to & seen], minlength=n)
     return np.asarray(ok & ((came >= config.min_ratio * due) | (due < LEAST_DUE)))
+
+
+def _chance(
+    scan: NDArray[np.int64], which: NDArray[np.int64], p: Array, seen: NDArray[np.bool_], hits: NDArray[np.int64]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Chance (P,) that a scan shows a tree, by range and bearing as the run's own trees have it, and whether nothing stands before it."""
+    far, bearing = np.hypot(p[:, 0], p[:, 1]), np.arctan2(p[:, 1], p[:, 0])
+    sure = (hits >= max(8.0, float(np.median(hits)) if len(hits) else 0.0))[which]
+    cell = np.minimum((far / 5.0).astype(int), 19) * 18 + ((bearing + np.pi) / (2 * np.pi) * 18).astype(int) % 18
+    total = np.bincount(cell[sure], minlength=360)
+    shown = np.bincount(cell[sure], seen[sure].astype(float), minlength=360)
+    return ((shown + 0.1) / (total + 1.0))[cell], ~_hidden(scan, far, bearing)
+
+
+def overdue(detections: Detections, tree: NDArray[np.int64], map_T_scan: Array, places: Array) -> NDArray[np.int64]:
+    """Sightings (T,) that are lacking of trees at `places` (T, 3), were they as the others of the run; 0 where they came now and then, and where
+    the run hardly looked. `tree` (N,) is that of each detection, -1 none. In high grass no beam passes where a felled tree stood; that it
+    never came tells as well.
+    """
+    d, n = detections, len(places)
+    used = tree >= 0
+    hits = np.bincount(tree[used], minlength=n)
+    scan, which = _pairs(d, map_T_scan, places, np.ones(n, bool))
+    anew = _looks(map_T_scan)[scan]
+    scan, which = scan[anew], which[anew]
+    seen = np.isin(scan * n + which, d.scan[used] * n + tree[used])
+    chance, open_to = _chance(scan, which, _seen_from(map_T_scan, scan, places, which), seen, hits)
+    due = np.bincount(which[open_to], chance[open_to], n)
+    came = np.bincount(which[open_to & seen], minlength=n)
+    return np.asarray(np.where((due >= OVERDUE) & (came <= STRAY * due), due - came, 0.0).astype(np.int64))
+
+
+OVERDUE, STRAY = 2.0 * LEAST_DUE, 0.1
+"""Sightings that must be due before their lack tells that a tree of an earlier map is gone, and the share of them that came all the same: a leaf, a twig."""
 
 
 def _hidden(scan: NDArray[np.int64], far: Array, bearing: Array) -> NDArray[np.bool_]:

@@ -42,6 +42,7 @@ class TrackTable:
         sigma: of `place`, m.
         first, last: distance driven at the first and last sighting, m.
         hits: sightings.
+        known: a tree of an earlier map, and no track of this run; `single`: it is known to have one stem.
     """
 
     place: Array
@@ -52,6 +53,8 @@ class TrackTable:
     first: Array
     last: Array
     hits: NDArray[np.int64]
+    known: NDArray[np.bool_]
+    single: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -359,4 +362,6 @@ def tabulate(
         first=first,
         last=last,
         hits=hits,
+        known=np.zeros(n, bool),
+        single=np.zeros(n, bool),
     )

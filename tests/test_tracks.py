@@ -13,7 +13,7 @@ from test_estimate import problem
 from topograph.geometry import Array, from_xyz_rpy, inverse, planar, transform, wrap, yaw_of
 from topograph.mapping.association import Made
 from topograph.motion import Motion, MotionConfig
-from topograph.trees import Tracker, TreesConfig, follow, screen, tabulate
+from topograph.trees import Tracker, TreesConfig, follow, screen, tabulate, with_trunks_way
 from topograph.trees.whole import misstep
 
 GATE = TreesConfig().gate
@@ -187,3 +187,20 @@ def test_what_was_decided_is_the_same_whatever_trees_are_called() -> None:
     few = tree.copy()
     few[399] = 1
     assert made._replace(tree=few).like(made) is None
+
+
+@pytest.mark.parametrize("seed", range(20, 26))
+def test_trunks_that_come_and_go_are_no_slip(seed: int) -> None:
+    """A vineyard, a stake beside each second vine, of which each scan shows one in seven: from scan to scan they are taken for each other, and the
+    wheels, which are right, stay right."""
+    rng = np.random.default_rng(seed)
+    row = np.arange(-5.0, 45.0, 1.15)
+    x = np.concatenate([row, row[::2] + 0.45])
+    trees = np.concatenate([np.column_stack([x, np.full(len(x), y), np.zeros(len(x))]) for y in (-2.2, 2.2)])
+    s = np.arange(0.0, 30.0, 0.14)
+    poses = planar(s, 0.0 * s, 0.0 * s)
+    d = problem(poses, trees, 0.04, rng, reach=9.0).detections
+    d = d.select(rng.random(len(d)) < 0.15)
+    d = replace(d, stamps_ns=1 + (np.arange(len(s)) * 1e8).astype(np.int64))
+    motion = Motion(stamps_ns=d.stamps_ns, odom_T_robot=poses, distance=s, turned=0 * s, gyro=True, wheels=True)
+    assert with_trunks_way(motion, d, np.zeros(0, np.int64)) is motion

@@ -6,7 +6,7 @@ their noise, the way that they tell stands in, with its deviation. The rule is `
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,11 +42,12 @@ def with_trunks_way(motion: Motion, d: Detections, fix_ns: Stamps) -> Motion:
     scans_ns = np.column_stack([d.stamps_ns[:-1], d.stamps_ns[1:]])
     near = _near(fix_ns, scans_ns)
     asked = _with_neighbours(~near, d.stamps_ns)
-    rows, legs = _legs(odom_T_robot, d, asked)
+    seen = _Seen.of(odom_T_robot, d)
+    rows, legs = _legs(odom_T_robot, d, asked, seen)
     if len(legs) < LEGS:
         return motion
     ns = scans_ns[rows]
-    slipping = _slipping(ns, legs) & ~near[rows]
+    slipping = _slipping(ns, legs, rows, seen) & ~near[rows]
     driven = np.linalg.norm(np.diff(odom_T_robot[:, :2, 3], axis=0), axis=1) > 0.01
     # Of all that was driven, as much as trunks tell of where they are asked.
     told = driven.sum() * len(legs) / asked.sum()
@@ -65,23 +66,56 @@ def _with_neighbours(asked: NDArray[np.bool_], scans_ns: Stamps) -> NDArray[np.b
     return np.asarray(np.searchsorted(at, scans_ns[:-1] + window, "right") > first)
 
 
-def _legs(odom_T_robot: Array, d: Detections, asked: NDArray[np.bool_]) -> tuple[NDArray[np.int64], Array]:
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """Trunks (M, 2) near the robot in its levelled frame, scan by scan; where those of each of S scans begin, `ends` (S + 1,); and the scans' places
+    (S, 2) and headings (S,) by dead reckoning."""
+
+    flat: Array
+    ends: NDArray[np.int64]
+    place: Array
+    yaw: Array
+
+    @staticmethod
+    def of(odom_T_robot: Array, d: Detections) -> _Seen:
+        yaw = yaw_of(odom_T_robot)
+        up = planar(odom_T_robot[:, 0, 3], odom_T_robot[:, 1, 3], yaw)
+        up[:, 2, 3] = odom_T_robot[:, 2, 3]
+        flat = transform((inverse(up) @ odom_T_robot)[d.scan], d.p)[:, :2]
+        use = (np.hypot(*flat.T) < REACH) & (d.score >= 0) & ~_rides(flat, d)
+        rows = np.flatnonzero(use)[np.argsort(d.scan[use], kind="stable")]
+        ends = np.searchsorted(d.scan[rows], np.arange(len(d.stamps_ns) + 1))
+        return _Seen(flat[rows], ends, odom_T_robot[:, :2, 3], yaw)
+
+    def at(self, k: int) -> Array:
+        """Trunks (N, 2) of scan `k` in the robot's frame."""
+        return self.flat[self.ends[k] : self.ends[k + 1]]
+
+    def turned(self, k: int, v: Array) -> Array:
+        """Vectors (N, 2) of the robot's frame of scan `k` in dead reckoning's axes."""
+        c, s = np.cos(self.yaw[k]), np.sin(self.yaw[k])
+        return np.asarray(v @ np.array([[c, s], [-s, c]]))
+
+    def standing(self, a: int, b: int, moved: Array, tolerance: float) -> int:
+        """Trunks of scan `b` where one of scan `a` is when the robot went `moved` (2,) further than dead reckoning has it, m."""
+        first = self.place[a] + self.turned(a, self.at(a))
+        second = self.place[b] + moved + self.turned(b, self.at(b))
+        if not len(first) or not len(second):
+            return 0
+        apart = np.hypot(*(second[:, None] - first[None]).transpose(2, 0, 1)).min(axis=1)
+        return int((apart < tolerance).sum())
+
+
+def _legs(odom_T_robot: Array, d: Detections, asked: NDArray[np.bool_], seen: _Seen) -> tuple[NDArray[np.int64], Array]:
     """Rows (L,) of the legs between scans that trunks tell of, among those `asked` for (S-1,), and (L, 5): what the trunks add to the leg (x, y, m, in
     the robot's frame), its way (x, y, m), their sigma."""
-    up = planar(odom_T_robot[:, 0, 3], odom_T_robot[:, 1, 3], yaw_of(odom_T_robot))
-    up[:, 2, 3] = odom_T_robot[:, 2, 3]
-    flat = transform((inverse(up) @ odom_T_robot)[d.scan], d.p)[:, :2]
-    use = (np.hypot(*flat.T) < REACH) & (d.score >= 0) & ~_rides(flat, d)
-    order = np.argsort(d.scan[use], kind="stable")
-    rows = np.flatnonzero(use)[order]
-    ends = np.searchsorted(d.scan[rows], np.arange(len(d.stamps_ns) + 1))
-    yaw = yaw_of(odom_T_robot)
+    yaw = seen.yaw
     told, legs = [], []
     for a in np.flatnonzero(asked).tolist():
         b = a + 1
         if not 0 < d.stamps_ns[b] - d.stamps_ns[a] < GAP_NS:
             continue
-        last, now = (flat[rows[ends[k] : ends[k + 1]]] for k in (a, b))
+        last, now = seen.at(a), seen.at(b)
         way = odom_T_robot[b, :2, 3] - odom_T_robot[a, :2, 3]
         c, s = np.cos(yaw[a]), np.sin(yaw[a])
         step = np.array([c * way[0] + s * way[1], -s * way[0] + c * way[1], yaw[b] - yaw[a]])
@@ -110,8 +144,9 @@ def _rides(flat: Array, d: Detections) -> NDArray[np.bool_]:
     return np.asarray(often[of.ravel()])
 
 
-def _slipping(ns: NDArray[np.int64], legs: Array) -> NDArray[np.bool_]:
-    """(L,) legs on which the wheels are contradicted."""
+def _slipping(ns: NDArray[np.int64], legs: Array, rows: NDArray[np.int64], seen: _Seen) -> NDArray[np.bool_]:
+    """(L,) legs, those after the scans `rows`, on which the wheels are contradicted: over a window the trunks went elsewhere, and from its first
+    scans to its last more of them stand still for it."""
     out = np.zeros(len(legs), bool)
     total = np.concatenate([np.zeros((1, 5)), np.cumsum(np.column_stack([legs[:, :4], legs[:, 4] ** 2]), axis=0)])
     j = np.searchsorted(ns[:, 0], ns[:, 0] + int(LONGEST_S * 1e9))
@@ -123,10 +158,34 @@ def _slipping(ns: NDArray[np.int64], legs: Array) -> NDArray[np.bool_]:
         off, way = float(np.hypot(*whole[:2])), float(np.hypot(*whole[2:4]))
         # Neighbouring scans share trunks: their noise cancels but at the ends.
         noise = float(np.sqrt(whole[4] / (k - i)))
-        if off > max(OFF, SHARE * way, SIGMAS * noise * 2.0):
+        if off > max(OFF, SHARE * way, SIGMAS * noise * 2.0) and _stands_better(legs[i:k], rows[i:k], seen, off):
             along = legs[i:k, :2] @ whole[:2] / off
             out[i:k] |= along > PART * off / (k - i)
     return out
+
+
+def _stands_better(legs: Array, rows: NDArray[np.int64], seen: _Seen, off: float) -> bool:
+    """Whether more trunks stand still from the beginning of a window of `legs` (W, 5) to its end when the robot went as they add up to than by the
+    wheels. From scan to scan trunks that come and go may be taken for their neighbours, all the way along a row of stakes.
+    """
+    tolerance = float(np.clip(0.5 * off, *STILL))
+    moved = np.cumsum([seen.turned(a, leg[:2]) for a, leg in zip(rows.tolist(), legs, strict=True)], axis=0)
+    by_trunks = by_wheels = 0
+    for i in range(ENDS):
+        for j in range(len(legs) - ENDS, len(legs)):
+            if j >= i:
+                a, b = int(rows[i]), int(rows[j]) + 1
+                by_trunks += seen.standing(a, b, moved[j] - (moved[i - 1] if i else 0.0), tolerance)
+                by_wheels += seen.standing(a, b, np.zeros(2), tolerance)
+    return by_trunks > BETTER * by_wheels
+
+
+ENDS = 3
+"""Scans at either end of a window that are laid onto each other."""
+STILL = (0.06, 0.15)
+"""Least and most that a trunk is off in both and stands still, m; half of what is in question, between."""
+BETTER = 2.0
+"""Times as many trunks must stand still by the trunks' way as by the wheels'."""
 
 
 def _corrected(motion: Motion, ns: NDArray[np.int64], legs: Array, slipping: NDArray[np.bool_]) -> Motion:

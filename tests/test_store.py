@@ -184,6 +184,18 @@ def test_a_killed_write_leaves_the_old_map(tmp_path: Path) -> None:
         assert len(store.load(path)) in (5, 800)
 
 
+def test_a_map_is_another_file_when_it_is_written_again(tmp_path: Path) -> None:
+    """Who has the old one open reads it to its end: nothing is written into it."""
+    path = tmp_path / "m.gpkg"
+    store.save(make(5, seed=1), path)
+    with path.open("rb") as held:
+        before = held.read()
+        store.save(make(8, seed=2), path)
+        held.seek(0)
+        assert held.read() == before
+    assert len(store.load(path)) == 8
+
+
 def test_edges_do_not_depend_on_scale() -> None:
     rng = np.random.default_rng(3)
     xy = rng.uniform(0, 50, (60, 2))

@@ -342,5 +342,6 @@ def test_covariance_of_a_pose_points_where_it_is_unsure() -> None:
         fix = localizer.update(z, [Odometry(stamp, "base_link", pose, np.zeros(6))]) or fix
     assert fix is not None
     assert fix.cov[3, 3] > 2.0 * fix.cov[4, 4]
+    assert np.sqrt(fix.cov[2, 2]) > 0.001  # rad: a hundred trunks, 0.02 to 0.3 m each, within 15 m
     assert np.all(np.linalg.eigvalsh(fix.cov) > 0)
     assert transform(inverse(fix.map_T_robot), fix.map_T_robot[:3, 3]) == pytest.approx(np.zeros(3), abs=1e-9)

@@ -14,7 +14,7 @@ LITTLE, COARSE, SEVERAL, ALIKE, ELSEWHERE, CONTRADICTED = REASONS = (
     "too few trees were seen to tell places apart",
     "trees are known too badly for how densely they stand",
     "several places of the map fit",
-    "the planting is so regular that another one of its design would fit as well (if that cannot be, set localize.alike to 1e-9)",
+    "the planting is so regular that another one of its design would fit as well: drive on",
     "nothing on this map fits what was seen well enough",
     "wheels or gyro contradict the trees for so long that nobody is believed",
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from topograph.compiled import determinant3, solve3
+from topograph.compiled import determinant3, quantile, solve3
 from topograph.places.search_kernels import diameter_kernel
 
 
@@ -86,8 +86,7 @@ def evidence_kernel(poses, marks, P, trees, grid, raster, so, felled, base, trus
     (M, 3, 3), mapped tree (M, n) of each landmark, noise scale (M,), and
     the log evidence (M,) of an orchard of the same design. `P` (2n, 2n) is the landmarks' covariance; see evidence.py.
     """
-    m, tree, other, dia, dia_var = marks.m, marks.tree, marks.other, marks.diameter, marks.diameter_var
-    xy, tvar, tdia, dmean, dsd = trees.xy, trees.var, trees.diameter, trees.diameter_mean, trees.diameter_sd
+    m, xy, tvar = marks.m, trees.xy, trees.var
     n, M = len(m), len(poses)
     log = np.full(M, -np.inf)
     alike = np.full(M, -np.inf)
@@ -124,13 +123,16 @@ def evidence_kernel(poses, marks, P, trees, grid, raster, so, felled, base, trus
             x, y, yaw, q, logdet, L = align_kernel(rows[:k], ids, m, P, xy, tvar, base, 0.0, 1.0, x, y, yaw)
         if not ok or not np.isfinite(yaw):  # two trees at one place fix no heading
             continue
-        fixed = 0.0
-        for i in range(n):
-            if ids[i] < 0:
-                fixed += other[i]
-            else:
-                fixed += tree[i] - diameter_kernel(dia[i], dia_var[i], tdia[ids[i]], dmean, dsd)
-        fixed += views_kernel(x, y, yaw, ids, xy, grid, seen, so, centre, reach)
+        # An orchard of the same design may explain what this one cannot: a tree that was planted anew aside.
+        aside = marks.other.copy()
+        anew_rows, anew_ids, anew_pose = rows[:k].copy(), ids.copy(), (x, y, yaw)
+        for _ in range(PARTINGS):  # what is far off has pulled the placement towards itself
+            left = part_kernel(anew_rows, anew_ids, rows, ids, aside, x, y, yaw, marks, trees, base, trust, seen, so)
+            if left == k:
+                break
+            k = left
+            x, y, yaw, q, logdet, L = align_kernel(rows[:k], ids, m, P, xy, tvar, base, 0.0, 1.0, x, y, yaw)
+        fixed = fixed_kernel(x, y, yaw, ids, aside, marks, trees, grid, seen, so, centre, reach)
         top = -np.inf
         total = 0.0
         dof = 2 * k - 3
@@ -151,13 +153,89 @@ def evidence_kernel(poses, marks, P, trees, grid, raster, so, felled, base, trus
             best = log[h]
         if log[h] > best - 6.0:
             # The same trees planted anew: their residuals are larger by both orchards' planting errors.
+            xa, ya, yawa = anew_pose
+            ka = len(anew_rows)
+            if ka > k:
+                fixed = fixed_kernel(xa, ya, yawa, anew_ids, marks.other, marks, trees, grid, seen, so, centre, reach)
             for a in range(len(scales)):
-                _, _, _, qa, la, La = align_kernel(rows[:k], ids, m, P, xy, tvar, base, wild, scales[a] ** 2, x, y, yaw)
+                _, _, _, qa, la, La = align_kernel(
+                    anew_rows, anew_ids, m, P, xy, tvar, base, wild, scales[a] ** 2, xa, ya, yawa
+                )
                 anew = (
-                    fixed - 0.5 * trust * qa - 0.5 * la - 0.5 * np.log(determinant3(La)) + (1.5 - k) * np.log(2 * np.pi)
+                    fixed
+                    - 0.5 * trust * qa
+                    - 0.5 * la
+                    - 0.5 * np.log(determinant3(La))
+                    + (1.5 - ka) * np.log(2 * np.pi)
                 )
                 alike[h] = np.logaddexp(alike[h], anew - np.log(len(scales)))
     return log, out, information, matched, scale, alike
+
+
+OFF, LEAST = 13.8, 3
+"""Squared deviations, about the usual ones of the placement, from which a landmark may be no sighting of its tree, and landmarks that stay matched."""
+REPLACED, BESIDE = 0.5, 0.3
+"""Share of felled trees that are replaced, and how far from the stump per axis, m."""
+PARTINGS = 4
+"""Times that they are parted and the placement is aligned without them."""
+
+
+@njit(cache=True, error_model="numpy")
+def part_kernel(matched, tree_of, rows, ids, aside, x, y, yaw, marks, trees, base, trust, seen, so):
+    """Of the `matched` landmarks (K,) and the trees `tree_of` (n,) of all, those that lie so far from their trees that they are something else, and the
+    trees were missed: a felled tree, and another planted beside its stump. The number of those that stay, which fill `rows`; `ids` (n,)
+    are the trees of all, -1 of what was parted, and `aside` (n,) what each costs as something else: of what was parted, as planted beside.
+    """
+    k = len(matched)
+    m, var, tree, other = marks.m, marks.var, marks.tree, marks.other
+    xy, tvar = trees.xy, trees.var
+    c, s = np.cos(yaw), np.sin(yaw)
+    off, d2 = np.empty(k), np.empty(k)
+    ids[:], aside[:] = tree_of, other
+    for a in range(k):
+        i = matched[a]
+        ex = xy[ids[i], 0] - x - c * m[i, 0] + s * m[i, 1]
+        ey = xy[ids[i], 1] - y - s * m[i, 0] - c * m[i, 1]
+        d2[a] = ex * ex + ey * ey
+        off[a] = d2[a] / (var[i] + base + tvar[ids[i]])
+    usual = max(quantile(off, 0.5) / 1.386, 1.0)  # the median of a chi-square with two degrees of freedom
+    left, n = k, 0
+    for a in range(k):
+        i = matched[a]
+        rows[n] = i
+        n += 1
+        if off[a] < OFF * usual or left <= LEAST:
+            continue
+        V = usual * (var[i] + base + tvar[ids[i]])
+        u, v = int(m[i, 0] - so[0]), int(m[i, 1] - so[1])
+        chance = 0.02
+        if 0 <= u < seen.shape[0] and 0 <= v < seen.shape[1]:
+            chance = max(chance, seen[u, v])
+        good = tree[i] + np.log(chance / (1.0 - chance)) - 0.5 * trust * off[a] / usual - np.log(2 * np.pi * V)
+        good -= diameter_kernel(
+            marks.diameter[i], marks.diameter_var[i], trees.diameter[ids[i]], trees.diameter_mean, trees.diameter_sd
+        )
+        planted = tree[i] + np.log(REPLACED) - 0.5 * d2[a] / (V + BESIDE**2) - np.log(2 * np.pi * (V + BESIDE**2))
+        planted = np.logaddexp(other[i], planted)
+        if good < planted:
+            ids[i], aside[i] = -1, planted
+            left -= 1
+            n -= 1
+    return n
+
+
+@njit(cache=True, error_model="numpy")
+def fixed_kernel(x, y, yaw, ids, other, marks, trees, grid, seen, so, centre, reach):
+    """Log chance of what is a tree and what is something else, `other` (n,), and of the trees in view to have been seen or missed."""
+    total = 0.0
+    for i in range(len(ids)):
+        if ids[i] < 0:
+            total += other[i]
+        else:
+            total += marks.tree[i] - diameter_kernel(
+                marks.diameter[i], marks.diameter_var[i], trees.diameter[ids[i]], trees.diameter_mean, trees.diameter_sd
+            )
+    return total + views_kernel(x, y, yaw, ids, trees.xy, grid, seen, so, centre, reach)
 
 
 @njit(cache=True, error_model="numpy")

@@ -23,7 +23,8 @@ class StartsConfig:
         layout: "grid" or "irregular" (hexagonal).
         trees: about how many; `spacing` between them, `row_spacing` between rows.
         jitter: planting error per axis; `gaps` share of empty places.
-        felled, new: share of mapped trees that are gone, and of trees that are not mapped.
+        felled, new: share of mapped trees that are gone, and of trees that are not mapped; `replanted`: of mapped trees that are gone and
+            replaced by another 0.3 to 0.5 m aside.
         map_sigma: the map's error per axis; `diameter`, `diameter_sd` of the population.
         view, sigma, miss, clutter: range of detection, its noise per axis, share missed, share of false ones among all.
         diameter_sigma: of a measured diameter; NaN measures none.
@@ -38,6 +39,7 @@ class StartsConfig:
     gaps: float = 0.05
     felled: float = 0.02
     new: float = 0.02
+    replanted: float = 0.0
     map_sigma: float = 0.03
     diameter: float = 0.27
     diameter_sd: float = 0.0
@@ -118,9 +120,14 @@ def world(config: StartsConfig, rng: np.random.Generator) -> World:
     stands = rng.random(len(xy)) >= c.felled
     n_new = rng.binomial(len(xy), c.new)
     low, high = xy.min(0) - 3.0, xy.max(0) + 3.0
+    now = xy
+    if c.replanted > 0:
+        aside, way = rng.uniform(0.3, 0.5, len(xy)), rng.uniform(-np.pi, np.pi, len(xy))
+        moved = np.stack([aside * np.cos(way), aside * np.sin(way)], axis=1)
+        now = xy + moved * (rng.random(len(xy)) < c.replanted)[:, None]
     new = rng.uniform(low, high, (n_new, 2))
     return World(
-        np.concatenate([xy[stands], new]),
+        np.concatenate([now[stands], new]),
         np.concatenate([diameters[stands], np.clip(rng.normal(c.diameter, c.diameter_sd, n_new), 0.05, None)]),
         mapped,
         diameters + (rng.normal(0, 0.01, len(xy)) if c.diameter_sd > 0 else 0.0),

@@ -90,6 +90,7 @@ def _moved(
         yield from messages
         return
     odometry = LidarOdometry(recording.frames.get, config.bags.base_frame)
+    recording.notes.append("the motion is that of the point clouds (KISS-ICP), not of wheels")
     for kind, product in messages:
         step = odometry.step(product) if isinstance(product, Scan) else None
         if step is not None:

@@ -1,6 +1,7 @@
 """Localization: the algebra against numbers, invariances, right or unknown, and the whole chain from bags."""
 
 import csv
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from topograph.localize import LocalizeConfig, Localizer, ThesisConfig, ThesisMe
 from topograph.localize.engine import Engine, on_top
 from topograph.localize.filter import Filter
 from topograph.localize.posterior import describe, weigh
-from topograph.localize.submap import Move, Submap, Sweep, Visibility
+from topograph.localize.submap import SECTORS, Move, Submap, Sweep, Visibility, open_to
 from topograph.localize.thesis import multilaterate
 from topograph.motion import Leg, Reckoner
 from topograph.places.index import MapIndex, build_index
@@ -591,3 +592,43 @@ def test_nothing_to_localize_with(mapped: Path) -> None:
     assert "--topic-odometry" in out.output
     out = runner.invoke(main, ["localize", str(mapped / "none.gpkg"), str(mapped / "run3")])
     assert out.exit_code == 5
+
+
+def test_a_record_of_passage_says_how_far_the_view_is_open() -> None:
+    free = np.zeros(2 * SECTORS, np.uint32)
+    free[:] = (1 << 12) - 1  # seen through to 12 m: what stands in the thirteenth may be seen
+    free[100:110] = (1 << 3) - 1  # a car at 3 m
+    far = open_to(free)
+    assert far[10] == 13.0
+    assert (far[51:54] == 4.0).all()  # but for its edges: the sensor stands beside the base
+    assert np.isinf(open_to(np.zeros(0, np.uint32))).all()
+
+
+def test_trees_behind_a_parked_car_are_not_missing() -> None:
+    """Nine tenths of the view are blocked from 2 m on for 10 m of the way, and some trunks of the rest are missed as ever."""
+    c = replace(SCENARIOS["A"], trees=300, miss=0.1, clutter=0.02)
+    config = told(c)
+    doubt = {True: 0.0, False: 0.0}
+    for seed, told_of_it in itertools.product(range(4), doubt):
+        w = world(c, np.random.default_rng([seed, 31]))
+        engine = Engine(index_of(w.mapped, config), config)
+        driven = 0.0
+        for s in drive(w, c, np.random.default_rng([seed, 32]), 25.0):
+            driven += s.distance
+            blocked = 10.0 < driven < 20.0
+            away = np.arctan2(s.p[:, 1], s.p[:, 0])
+            keep = ~(blocked & (away > -2.4) & (np.hypot(*s.p.T) > 2.0))
+            bearing = (np.arange(SECTORS) + 0.5) * (2 * np.pi / SECTORS) - np.pi
+            view = np.where(blocked & told_of_it & (bearing > -2.4), 3.0, np.inf)
+            n = int(keep.sum())
+            cov = np.diag([(0.02 * s.distance) ** 2 + 1e-4] * 2 + [0.007**2 * max(s.distance, 0.01)])
+            engine.step(
+                Move(s.motion, cov, s.distance),
+                Sweep(
+                    s.p[keep], np.tile(c.sigma**2 * np.eye(2), (n, 1, 1)), np.full(n, np.nan), np.full(n, 0.01), view
+                ),
+            )
+            if blocked:
+                doubt[told_of_it] += engine.sums[0]
+        assert engine.losses == 0 or not told_of_it
+    assert doubt[True] < 0.5 * doubt[False]

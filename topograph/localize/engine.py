@@ -232,7 +232,7 @@ class Engine:
         self._bring_in(f)
         m2, logdet = f.innovations(z, used.cov)
         match = assign(m2, logdet, c.gate)
-        blocked = sectors(z)
+        blocked = np.minimum(sectors(z), used.open_to)
         reach, hidden = in_view(f.mean, f.n, blocked)
         found = np.zeros(f.n, bool)
         found[match[match >= 0]] = True

@@ -18,7 +18,7 @@ from topograph.localize.belief import Belief
 from topograph.localize.config import LocalizeConfig
 from topograph.localize.engine import Engine
 from topograph.localize.method import Fix, Method, Report
-from topograph.localize.submap import Move, Sweep
+from topograph.localize.submap import Move, Sweep, open_to
 from topograph.motion import Leg, Reckoner
 from topograph.places.index import build_index
 from topograph.topomap import TopoMap
@@ -384,4 +384,5 @@ def sweep_of(
     )  # no covariance: only its size is believed
     flat[torn, 0, 1] = flat[torn, 1, 0] = 0.0
     ok = np.isfinite(p).all(axis=1) & (reach > 0.3) & trunks.likely
-    return Sweep(p[ok, :2], flat[ok], trunks.diameter[ok], np.full(int(ok.sum()), 0.04**2)), np.flatnonzero(ok)
+    sweep = Sweep(p[ok, :2], flat[ok], trunks.diameter[ok], np.full(int(ok.sum()), 0.04**2), open_to(trunks.free))
+    return sweep, np.flatnonzero(ok)

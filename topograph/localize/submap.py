@@ -6,7 +6,7 @@ same side) would otherwise be counted once per scan and the posterior would lie.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,15 +19,20 @@ from topograph.localize.filter_kernels import assign, enter_kernel, in_view
 BINS = np.array([5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 60.0])
 
 
+SECTORS = 180
+"""Bearings of the view, two degrees each."""
+
+
 @dataclass(frozen=True, slots=True)
 class Sweep:
     """Trunks of one scan in the robot's levelled frame: `p` (N, 2) m, `cov` (N, 2, 2), `diameter` (N,) m or NaN,
-    `diameter_var` (N,) m²."""
+    `diameter_var` (N,) m². `open_to` (SECTORS,) m by bearing, see `open_to`."""
 
     p: Array
     cov: Array
     diameter: Array
     diameter_var: Array
+    open_to: Array = field(default_factory=lambda: np.full(SECTORS, np.inf))
 
     def __len__(self) -> int:
         return len(self.p)
@@ -155,7 +160,7 @@ def in_reach(sweep: Sweep, config: LocalizeConfig) -> tuple[Sweep, NDArray[np.in
     """The trunks that are near enough to use, with the deviation that the view of a trunk adds, and their rows."""
     rows = np.flatnonzero(np.hypot(*sweep.p.T) < config.view) if len(sweep) else np.zeros(0, np.int64)
     cov = sweep.cov[rows] + config.trunk_sigma**2 * np.eye(2)
-    return Sweep(sweep.p[rows], cov, sweep.diameter[rows], sweep.diameter_var[rows]), rows
+    return Sweep(sweep.p[rows], cov, sweep.diameter[rows], sweep.diameter_var[rows], sweep.open_to), rows
 
 
 def absorb(f: Filter, seen: Sweep, m2: Array, match: NDArray[np.int64], gate: float) -> None:
@@ -171,7 +176,23 @@ def absorb(f: Filter, seen: Sweep, m2: Array, match: NDArray[np.int64], gate: fl
         f.count(k, seen.diameter[i], seen.diameter_var[i], float(np.hypot(*seen.p[i])))
 
 
-def sectors(z: Array, n: int = 180) -> Array:
+def open_to(free: NDArray[np.uint32]) -> Array:
+    """Range (SECTORS,) up to which a scan saw through at trunk height, by bearing, m, of its record of passage `free` (2 SECTORS,): behind a parked vehicle
+    no tree is missing. Infinity where there is no record. A trunk fills the cell of a metre in which it stands, and the one before.
+    """
+    if len(free) != 2 * SECTORS:
+        return np.full(SECTORS, np.inf)
+    far = (
+        np.where(free > 0, np.floor(np.log2(np.maximum(free, 1).astype(float))) + 2.0, 0.0)
+        .reshape(SECTORS, 2)
+        .max(axis=1)
+    )
+    return np.asarray(
+        np.maximum(far, np.maximum(np.roll(far, 1), np.roll(far, -1)))
+    )  # the sensor stands beside the base
+
+
+def sectors(z: Array, n: int = SECTORS) -> Array:
     """Range (n,) of the nearest trunk by bearing; infinity where the view is free."""
     out = np.full(n, np.inf)
     if len(z):

@@ -155,14 +155,15 @@ def evidence_kernel(poses, marks, P, trees, grid, raster, so, felled, base, trus
             # The same trees planted anew: their residuals are larger by both orchards' planting errors.
             xa, ya, yawa = anew_pose
             ka = len(anew_rows)
+            whole = fixed
             if ka > k:
-                fixed = fixed_kernel(xa, ya, yawa, anew_ids, marks.other, marks, trees, grid, seen, so, centre, reach)
+                whole = fixed_kernel(xa, ya, yawa, anew_ids, marks.other, marks, trees, grid, seen, so, centre, reach)
             for a in range(len(scales)):
                 _, _, _, qa, la, La = align_kernel(
                     anew_rows, anew_ids, m, P, xy, tvar, base, wild, scales[a] ** 2, xa, ya, yawa
                 )
                 anew = (
-                    fixed
+                    whole
                     - 0.5 * trust * qa
                     - 0.5 * la
                     - 0.5 * np.log(determinant3(La))

@@ -242,8 +242,7 @@ def _shown_often(
     found = np.bincount(which[expected & seen], minlength=n)
     ok = (found / np.maximum(asked, 1) >= config.min_ratio) | (asked < 4)
     # From places where trees are rarely seen, a run of many laps should have seen one now and then.
-    due = np.bincount(which[open_to], chance[open_to], n)
-    came = np.bincount(which[open_to & seen], minlength=n)
+    due, came = _due(which, chance, open_to, seen, n)
     return np.asarray(ok & ((came >= config.min_ratio * due) | (due < LEAST_DUE)))
 
 
@@ -259,6 +258,14 @@ def _chance(
     return ((shown + 0.1) / (total + 1.0))[cell], ~_hidden(scan, far, bearing)
 
 
+def _due(
+    which: NDArray[np.int64], chance: Array, open_to: NDArray[np.bool_], seen: NDArray[np.bool_], n: int
+) -> tuple[Array, NDArray[np.int64]]:
+    """Sightings (n,) that each tree would have had by `_chance`, and those that it had."""
+    due = np.asarray(np.bincount(which[open_to], chance[open_to], n), float)
+    return due, np.asarray(np.bincount(which[open_to & seen], minlength=n), np.int64)
+
+
 def overdue(detections: Detections, tree: NDArray[np.int64], map_T_scan: Array, places: Array) -> NDArray[np.int64]:
     """Sightings (T,) that are lacking of trees at `places` (T, 3), were they as the others of the run; 0 where they came now and then, and where
     the run hardly looked. `tree` (N,) is that of each detection, -1 none. In high grass no beam passes where a felled tree stood; that it
@@ -272,8 +279,7 @@ def overdue(detections: Detections, tree: NDArray[np.int64], map_T_scan: Array, 
     scan, which = scan[anew], which[anew]
     seen = np.isin(scan * n + which, d.scan[used] * n + tree[used])
     chance, open_to = _chance(scan, which, _seen_from(map_T_scan, scan, places, which), seen, hits)
-    due = np.bincount(which[open_to], chance[open_to], n)
-    came = np.bincount(which[open_to & seen], minlength=n)
+    due, came = _due(which, chance, open_to, seen, n)
     return np.asarray(np.where((due >= OVERDUE) & (came <= STRAY * due), due - came, 0.0).astype(np.int64))
 
 

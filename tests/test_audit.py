@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from test_estimate import problem
 
 from topograph import audit
+from topograph.audit.seam import common
 from topograph.estimate import Estimate, EstimateConfig, Fixes, Problem, graph
 from topograph.geometry import Array, exp, inverse, planar, transform, yaw_of
 
@@ -169,6 +170,46 @@ def test_trees_that_hardly_a_scan_shows_are_doubted() -> None:
     assert found.value > found.bound
     assert not list(audit.seldom(300, 200))
     assert not list(audit.seldom(20, 1))
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    sightings=st.lists(st.tuples(st.integers(0, 9), st.integers(0, 4)), max_size=40),
+    reach=st.integers(1, 5),
+)
+def test_trees_seen_on_both_sides_are_counted(sightings: list[tuple[int, int]], reach: int) -> None:
+    keyframe, tree = (np.array([s[k] for s in sightings], np.int64) for k in (0, 1))
+    both, fewer = common(keyframe, tree, 10, reach)
+    for k in range(10):
+        before = {t for f, t in sightings if k - reach <= f < k}
+        after = {t for f, t in sightings if k <= f < k + reach}
+        assert both[k] == len(before & after)
+        assert fewer[k] == min(len(before), len(after))
+
+
+def test_a_run_that_falls_apart_is_doubted_where_no_fixes_hold_it() -> None:
+    """On a drive through a real orchard a turn was off by 8°; from there on the map stood beside itself, called sound."""
+    poses = planar(0.5 * np.arange(60.0), 0.0, 0.0)
+    trees = np.stack(np.meshgrid(np.arange(0.0, 30.0, 2.0), [-3.0, 3.0, 6.0], [0.0]), axis=3).reshape(-1, 3)
+    p = problem(poses, trees, 0.03, np.random.default_rng(2), reach=8.0)
+    assert not list(audit.seam(p))
+    s = p.sightings
+    broken = replace(p, sightings=replace(s, tree=s.tree + len(trees) * (s.keyframe >= 31)), n_trees=2 * len(trees))
+    (found,) = audit.seam(broken)
+    assert (found.name, found.refuses) == ("seam", False)
+    assert "at 31 s" in found.sentence
+    # A few that go on are no continuity; two in five are.
+    for share, said in ((0.2, True), (0.6, False)):
+        goes_on = np.isin(s.tree, np.random.default_rng(3).permutation(len(trees))[: int(share * len(trees))])
+        some = replace(s, tree=s.tree + len(trees) * ((s.keyframe >= 31) & ~goes_on))
+        assert bool(list(audit.seam(replace(broken, sightings=some)))) == said
+    n = len(poses)
+    at = transform(poses, np.zeros((n, 3)))
+    held = Fixes(np.arange(n), np.zeros((n, 3)), at, np.tile(1e-4 * np.eye(3), (n, 1, 1)), np.zeros((n, 3)))
+    assert not list(audit.seam(replace(broken, fixes=held)))
+    # Without a scan for a while others are in view.
+    gap = replace(broken.motion, distance=broken.motion.distance + 9.0 * (np.arange(n) >= 31))
+    assert not list(audit.seam(replace(broken, motion=gap)))
 
 
 def test_a_gyro_that_drifts_while_the_robot_stands_is_no_astray_path() -> None:

@@ -16,6 +16,7 @@ from topograph.audit.checks import (
     unsure,
 )
 from topograph.audit.reckoned import way
+from topograph.audit.seam import seam
 from topograph.audit.verdict import Finding, Verdict
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "lean",
     "offsets",
     "rows",
+    "seam",
     "seldom",
     "standing",
     "trunks",

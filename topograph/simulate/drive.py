@@ -32,7 +32,11 @@ class Drive:
 def drive(orchard: Orchard, config: DriveConfig, seed: int) -> Drive:
     """The drive of one run; equal seeds give equal drives."""
     rng = np.random.default_rng([seed, 23, config.run])
-    line = _smooth(np.concatenate([_waypoints(orchard, config.run)] * config.laps), rng)
+    return along(orchard, _smooth(np.concatenate([_waypoints(orchard, config.run)] * config.laps), rng), config)
+
+
+def along(orchard: Orchard, line: Array, config: DriveConfig) -> Drive:
+    """The drive along a line (K, 2), m."""
     s_line = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
     s = _distance(float(s_line[-1]), config)
     s = s[: int(config.longest_s / STEP_S)]

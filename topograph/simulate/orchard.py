@@ -36,7 +36,7 @@ class Orchard:
 def plant(config: OrchardConfig, seed: int) -> Orchard:
     """An orchard of a design; equal seeds give equal orchards."""
     rng = np.random.default_rng([seed, 17])
-    places = _places(config, rng)
+    places = places_of(config, rng)
     ground = lay_out(config, places, rng)
     build = Build(ground, rng)
     trees = [build.tree(config, xy, i) for i, xy in enumerate(places)]
@@ -55,7 +55,8 @@ def plant(config: OrchardConfig, seed: int) -> Orchard:
     )
 
 
-def _places(config: OrchardConfig, rng: np.random.Generator) -> Array:
+def places_of(config: OrchardConfig, rng: np.random.Generator) -> Array:
+    """Where a design plants its trees, (N, 2)."""
     i, j = np.meshgrid(np.arange(config.columns), np.arange(config.rows), indexing="ij")
     xy = np.stack([i.ravel() * config.tree_spacing, j.ravel() * config.row_spacing], axis=1).astype(float)
     if config.layout == "wild":

@@ -36,6 +36,11 @@ DATUM = Datum(40.1863, -8.4152, 95.0)
 """Near the thesis's orchard in Coimbra; each seed shifts it."""
 
 
+Event = tuple[int, Callable[[], None]]
+Look = Callable[[Orchard, SensorConfig, Array, float, int], Sweep]
+"""Casts a sweep into a scene, as `lidar.sweep`."""
+
+
 def record(
     path: Path,
     seed: int,
@@ -51,7 +56,21 @@ def record(
     """
     run, sensor = run or DriveConfig(), sensor or SensorConfig()
     scene = plant(DESIGNS[orchard] if isinstance(orchard, str) else orchard, seed)
-    way = drive(scene, run, seed)
+    return record_in(path, scene, drive(scene, run, seed), seed, run, sensor, noise or DetectionNoise(), progress)
+
+
+def record_in(
+    path: Path,
+    scene: Orchard,
+    way: Drive,
+    seed: int,
+    run: DriveConfig,
+    sensor: SensorConfig,
+    noise: DetectionNoise,
+    progress: Callable[[float], None] | None = None,
+    look: Look = sweep,
+) -> Truth:
+    """`record` in any scene, on any way through it; `look` casts the sweeps."""
     rng = np.random.default_rng([seed, 41, run.run])
     datum = Datum(DATUM.lat + 1e-3 * (seed % 97), DATUM.lon - 1e-3 * (seed % 89), DATUM.h)
     seen: list[Any] = []
@@ -62,9 +81,9 @@ def record(
         bag.tf_static(start, {("base_link", name): T for name, T in mounts.items()})
         streams = [_small(bag, way, sensor, datum, rng)]
         if sensor.detections:
-            streams.append(_trunks(bag, scene, way, sensor, noise or DetectionNoise(), rng, run))
+            streams.append(_trunks(bag, scene, way, sensor, noise, rng, run))
         else:
-            streams.append(_clouds(bag, scene, way, sensor, seed, seen, scan_stamps, run))
+            streams.append(_clouds(bag, scene, way, sensor, seed, seen, scan_stamps, run, look))
         span = float(way.stamps_ns[-1] - start)
         for log_ns, write in heapq.merge(*streams, key=lambda e: e[0]):
             write()
@@ -83,9 +102,6 @@ def record(
     )
     truth.save(path.with_name(path.stem + ".truth"))
     return truth
-
-
-Event = tuple[int, Callable[[], None]]
 
 
 def _small(bag: BagWriter, way: Drive, sensor: SensorConfig, datum: Datum, rng: np.random.Generator) -> Iterator[Event]:
@@ -128,6 +144,7 @@ def _clouds(
     seen: list[Any],
     stamps: list[int],
     run: DriveConfig,
+    look: Look,
 ) -> Iterator[Event]:
     span, period = int(1e9 * sensor.sweep_s), int(1e9 / sensor.sweep_hz)
     starts = np.arange(int(way.stamps_ns[0]), int(way.stamps_ns[-1]) - span, period, dtype=np.int64)
@@ -136,7 +153,7 @@ def _clouds(
         end = start + span  # velodyne_driver stamps the last packet: times are negative
 
         def write(k: int = k, start: int = start, end: int = end) -> None:
-            s = sweep(
+            s = look(
                 scene,
                 sensor,
                 sensors.columns(way, sensor, start),

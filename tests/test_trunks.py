@@ -5,11 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from topograph.bags import Odometry, Recording, Scan
 from topograph.config import Config
 from topograph.evaluate import Truth, trunk_metrics
-from topograph.geometry import exp
+from topograph.geometry import exp, from_xyz_rpy, transform
 from topograph.pipeline import read_run
 from topograph.trunks import ThesisTrunksConfig, TrunksConfig, fit
 from topograph.trunks.detector import Detector, candidates
@@ -17,6 +19,7 @@ from topograph.trunks.features import FEATURES
 from topograph.trunks.fit import AXIS_Z, OUT_SIZE, X, suppress, vertical
 from topograph.trunks.frontend import FrontEnd
 from topograph.trunks.organise import rings_of
+from topograph.trunks.origin import seen_from
 from topograph.trunks.runs import COUNT, PX, PY, PZ, RUN_SIZE
 from topograph.trunks.score import KIND_PRIOR, kinds, network
 from topograph.trunks.thesis import ThesisDetector
@@ -327,3 +330,57 @@ def test_a_broken_wheel_message_costs_itself(value: float) -> None:
     assert len(found) > 0
     still = Detector(MOUNT, TrunksConfig())(scan, np.zeros(6))
     assert len(Detector(MOUNT, TrunksConfig())(scan, np.full(6, value))) == len(still)
+
+
+@settings(max_examples=15, deadline=None)
+@given(
+    rings=st.sampled_from([16, 32]),
+    place=st.tuples(*[st.floats(-0.8, 0.8)] * 2, st.floats(0.4, 2.0)),
+    turn=st.tuples(*[st.floats(-0.4, 0.4)] * 2, st.floats(-3.0, 3.0)),
+    field=st.booleans(),
+)
+def test_clouds_that_were_moved_out_of_the_lidars_frame_give_the_same_trunks(
+    rings: int, place: tuple[float, float, float], turn: tuple[float, float, float], field: bool
+) -> None:
+    """Drivers and filters publish clouds in `base_link`, often without the ring field: about the base there are no rings, and half of the trunks were missed."""
+    scan = cylinder_scene(
+        rings, 4.0, 1.0, 0.3, slope=0.12
+    )  # a level plane shows circles, which are rings about all that is above their middle
+    base_T_lidar = from_xyz_rpy(*place, *turn)
+    frames = {"base_link": np.eye(4), "imu": from_xyz_rpy(0.1, -0.3, 0.35, 0, 0, 0.5), "lidar": base_T_lidar}
+    as_taken = FrontEnd(frames.__getitem__, frames.get, frames=lambda: frames)
+    moved = replace(scan, frame="base_link", xyz=transform(base_T_lidar, scan.xyz).astype(np.float32))
+    moved = moved if field else replace(moved, ring=None)
+    as_moved = FrontEnd(frames.__getitem__, frames.get, frames=lambda: frames)
+    expected, found = as_taken.see(scan), as_moved.see(moved)
+    assert not as_taken.notes
+    assert "'lidar'" in as_moved.notes[0]
+    assert len(found) == len(expected)
+    np.testing.assert_allclose(found.p, expected.p, atol=2e-3)
+    np.testing.assert_allclose(found.eye, expected.eye, atol=1e-6)
+    again = as_moved.see(moved)
+    np.testing.assert_array_equal(again.p, found.p)
+    assert len(as_moved.notes) == 1
+
+
+def test_a_cloud_is_where_it_says_where_no_frame_shows_rings() -> None:
+    """A LiDAR without rings, one whose frame is unknown, and a scan of few points, which decides for none."""
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=(6000, 3)) * [1.0, 1.0, 0.3]
+    cloud = (direction / np.linalg.norm(direction, axis=1, keepdims=True) * rng.uniform(2, 30, (6000, 1))).astype(np.float32)  # fmt: skip
+    frames = {"base_link": np.eye(4), "imu": from_xyz_rpy(0.2, 0.0, 0.4, 0, 0, 0), "lidar": MOUNT}
+    assert seen_from(cloud, frames) is None
+    scan = cylinder_scene(16, 4.0, 1.0, 0.3, slope=0.12)
+    unknown = transform(from_xyz_rpy(0.1, 0.2, 1.3, 0.1, 0.0, 0.0), scan.xyz).astype(np.float32)
+    assert seen_from(unknown, frames) is None
+    moved = replace(scan, frame="base_link", ring=None, xyz=transform(MOUNT, scan.xyz).astype(np.float32))
+    lost = FrontEnd(frames.__getitem__, frames.get)
+    lost.see(moved)
+    assert "--extrinsic lidar=" in lost.notes[0]  # which makes it one of the frames
+    at_home = FrontEnd(lambda _: np.eye(4), frames.get)
+    at_home.see(replace(scan, ring=None))
+    assert not at_home.notes
+    door = FrontEnd(frames.__getitem__, frames.get, frames=lambda: frames)
+    door.see(replace(moved, xyz=moved.xyz[:400]))
+    assert not door.notes
+    assert door.see(moved).eye[2] == pytest.approx(0.8)

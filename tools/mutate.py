@@ -78,6 +78,7 @@ BREAKS = [
     Break("one tree of old ground holds the heading", T + "trees/loops.py", "HOLDING = 3", "HOLDING = 1", P + "test_real_runs.py -k without_a_fix"),
     Break("a lattice's trees count in full", T + "trees/loops.py", "among = log - alike *", "among = log - 0.0 *", P + "test_loops.py"),
     Break("a run falls apart unsaid", T + "audit/seam.py", "both = _covered(np.maximum(f + 1, g - reach + 1)", "both = _covered(np.maximum(f, g - reach)", P + "test_audit.py"),
+    Break("moved clouds are seen from where they were moved", T + "trunks/frontend.py", "if lidar is not None:", "if lidar is not None and False:", P + "test_trunks.py -k moved_out"),
     Break("a map of posts is sound", T + "audit/checks.py", "doubted > UNSURE * len(told)", "doubted > len(told)", P + "test_audit.py"),
     Break("METIS is handed lone variables", T + "estimate/solver.py", "not _alone(graph)", "True", P + "test_estimate.py -k large_graph"),
     Break("kinds are certain", T + "trees/existence.py", "DECEIVED = 0.03", "DECEIVED = 0.0", "tests/test_screen.py"),

@@ -39,7 +39,7 @@ CLEAR = 0.7
 
 LANE = 0.3
 """To the right of the cheapest way, m: where it leads back, there is a bend and no cusp."""
-WIDE, TIGHTEST = 0.5, 0.25
+WIDE, TIGHTEST = 0.5, 0.2
 """Radius of a turn, m, that is taken at once, and that is taken where there is no other: what doubles back is no way for a robot that does not reverse."""
 
 

@@ -70,6 +70,11 @@ class Frames:
             )
         return found
 
+    def all(self) -> dict[str, Array]:
+        """`base_T_frame` (4, 4) of all frames with a way to the base."""
+        found = {f: self.find(f) for f in sorted({*self._edges, *self._given})}
+        return {f: T for f, T in found.items() if T is not None}
+
     def names(self) -> list[str]:
         """All frames with a way to the base."""
-        return sorted(f for f in {*self._edges, *self._given} if self.find(f) is not None)
+        return list(self.all())

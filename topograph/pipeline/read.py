@@ -79,6 +79,7 @@ def stream(
     for _, scan in pending:
         yield from _careful(front_end, scan, recording.skipped)
     recording.untimed += front_end.untimed
+    recording.notes += front_end.notes
     progress("read", 1.0)
 
 
@@ -279,6 +280,7 @@ class _Part:
     undecoded: dict[str, str]
     clocks: list[str]
     untimed: int
+    notes: list[str]
 
 
 def _in_parts(
@@ -308,6 +310,7 @@ def _in_parts(
         recording.skipped.update(part.skipped)
         recording.undecoded.update(part.undecoded)
         recording.untimed += part.untimed
+        recording.notes += [n for n in part.notes if n not in recording.notes]
         recording.given["points"] += part.given
     recording.count_missing(recording.chosen["points"], "points")
     return Scans.joined([part.trunks for part in parts])
@@ -346,6 +349,7 @@ def _detect_part(paths: Sequence[Path], config: Config, start_ns: int, stop_ns: 
             undecoded=recording.undecoded,
             clocks=recording.clocks.notes,
             untimed=front_end.untimed,
+            notes=front_end.notes,
         )
 
 
@@ -362,7 +366,9 @@ def _front_end(recording: Recording, config: Config) -> FrontEnd:
     """The front end with the mountings that the recording knows."""
     from topograph.trunks.frontend import FrontEnd
 
-    return FrontEnd(recording.frames.get, recording.frames.find, config.trunks, config.thesis_trunks)
+    return FrontEnd(
+        recording.frames.get, recording.frames.find, config.trunks, config.thesis_trunks, recording.frames.all
+    )
 
 
 def scan_near(paths: Sequence[Path], config: Config, stamp_ns: int) -> tuple[Scan, Array]:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 
 from topograph.bags import Imu, Odometry, Scan, Trunks
-from topograph.geometry import Array
+from topograph.geometry import Array, inverse, transform
 from topograph.motion import RecentMotion
 from topograph.trunks.config import TrunksConfig
 from topograph.trunks.detector import Detector
+from topograph.trunks.origin import LEAST, in_rings, seen_from
 from topograph.trunks.smear import smeared
 from topograph.trunks.thesis import ThesisDetector, ThesisTrunksConfig
 
@@ -36,9 +38,11 @@ class FrontEnd:
     Args:
         mount: frame of a LiDAR -> base_T_lidar (4, 4), or an error; asked once a frame.
         find: frame of an IMU -> its mounting (4, 4) or None.
+        frames: all frames whose place on the robot is known, with their mountings (4, 4): one of them may be the LiDAR's, where clouds were moved out of it.
 
     Attributes:
         untimed: sweeps whose points had no time.
+        notes: what was found out about the clouds' frames.
     """
 
     def __init__(
@@ -47,10 +51,13 @@ class FrontEnd:
         find: Callable[[str], Array | None],
         config: TrunksConfig | None = None,
         thesis: ThesisTrunksConfig | None = None,
+        frames: Callable[[], Mapping[str, Array]] = dict,
     ) -> None:
         self.config, self.thesis = config or TrunksConfig(), thesis or ThesisTrunksConfig()
         self.untimed = 0
-        self._mount, self._find = mount, find
+        self.notes: list[str] = []
+        self._mount, self._find, self._frames = mount, find, frames
+        self._lidar_T_frame: dict[str, Array | None] = {}
         self._motion = RecentMotion()
         self._imu_frame: str | None = None
         self._detect: dict[str, Detect] = {}
@@ -68,8 +75,12 @@ class FrontEnd:
 
         Where no point has a time, or nothing is known of the motion, the stated covariance is the wider for it.
         """
-        if scan.frame not in self._detect:
-            self._detect[scan.frame] = RIVALS[self.config.front_end](self._mount(scan.frame), self.config, self.thesis)
+        undecided = scan.frame not in self._lidar_T_frame and len(scan.xyz) >= LEAST
+        if undecided or scan.frame not in self._detect:
+            self._place(scan)
+        back = self._lidar_T_frame.get(scan.frame)
+        if back is not None:
+            scan = replace(scan, xyz=transform(back, scan.xyz).astype(np.float32))
         first = last = scan.stamp_ns
         timed = scan.offset is not None and bool(np.isfinite(scan.offset).any())
         if timed and scan.offset is not None:  # the sweep may lie before its stamp, after it, or around it
@@ -80,3 +91,23 @@ class FrontEnd:
         twist, source = self._motion.twist(first, last)
         trunks = self._detect[scan.frame](scan, twist, self._motion.up(scan.stamp_ns))
         return trunks if timed and source != "none" else smeared(trunks, twist, source != "none")
+
+    def _place(self, scan: Scan) -> None:
+        """Where the scan's points were seen from: its frame, or another one about which they lie in rings. A scan of few points does not decide."""
+        base_T_lidar = self._mount(scan.frame)
+        to = inverse(base_T_lidar)
+        others = {name: to @ T for name, T in self._frames().items() if name != scan.frame}
+        lidar = seen_from(scan.xyz, others)
+        if lidar is not None:
+            base_T_lidar = base_T_lidar @ others[lidar]
+            self.notes.append(
+                f"the clouds are in {scan.frame!r} and lie in rings about {lidar!r}: taken as seen from there"
+            )
+        elif scan.ring is None and np.allclose(base_T_lidar, np.eye(4)) and not in_rings(scan.xyz):
+            self.notes.append(
+                f"the clouds are in {scan.frame!r}, tell no rings and lie in none about it: if they were moved there from the LiDAR's frame, say where "
+                "that is: --extrinsic lidar=X,Y,Z,ROLL,PITCH,YAW (metres, radians)"
+            )
+        if len(scan.xyz) >= LEAST:
+            self._lidar_T_frame[scan.frame] = None if lidar is None else inverse(others[lidar])
+        self._detect[scan.frame] = RIVALS[self.config.front_end](base_T_lidar, self.config, self.thesis)

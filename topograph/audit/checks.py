@@ -295,14 +295,15 @@ def unclaimed(p: Array, score: Array, used: Array, tree: NDArray[np.int64]) -> I
     share = 1.0 - claimed / n
     if share > UNCLAIMED:
         nothing = share > NOBODYS
+        wrong = "the LiDAR is mounted otherwise than TF says, its axes or its clock are wrong, or the wheels are"
         why = (
-            "the LiDAR is mounted otherwise than TF says, its axes or its clock are wrong, or the wheels are"
+            f"they do not stand still in it, so {wrong}"
             if nothing
-            else "much here looks like a trunk from one side alone (bushes, undergrowth, people), or the LiDAR is mounted otherwise than TF says, or its clock is wrong"
+            else f"they look like trunks from one side alone (bushes, undergrowth), or they do not stand still (people; or {wrong})"
         )
         yield Finding(
             name="trunks of no tree", value=share, bound=UNCLAIMED, unit="", refuses=nothing,
-            sentence=f"{100 * share:.0f} % of the trunks that were surely seen belong to no tree of the map, for they do not stand still in it: {why}",
+            sentence=f"{100 * share:.0f} % of the trunks that were surely seen belong to no tree of the map: {why}",
         )  # fmt: skip
 
 

@@ -6,57 +6,97 @@ from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import binom
 
+from topograph.audit.checks import AWAY
 from topograph.audit.verdict import Finding
-from topograph.estimate import Problem
+from topograph.estimate import Estimate, Problem
+from topograph.geometry import Array, transform
 
 SEAM = 0.35
 """Share of the trees around a moment that are seen on both sides of it, below which they are other ones (clean: 0.72 and more in simulated runs at 5 scans
-a second and at 1, 0.79 in a forest, 0.43 where a single layer of a LiDAR tells twigs from trunks badly; where the turn of a robot without
-a gyro was off by 8 and 14 degrees: 0.1 and 0.32)."""
+a second and at 1, 0.67 in those of another author, 0.79 in a forest, 0.43 where a single layer of a LiDAR tells twigs from trunks badly; where the turn of
+a robot without a gyro was off by 8 and 14 degrees: 0.1 and 0.32)."""
+CHANCE = 0.01
+"""That so few go on somewhere in a run in which trees go on as they usually do there."""
 REACHES = (2, 4)
-"""Keyframes on each side, each of which has to say so: a sensor that looks ahead alone shows others within a few of them as it turns."""
-IN_VIEW = 10
-"""Trees on each side below which chance makes seams."""
-STEP = 1.5
-"""Where more was driven unseen between two keyframes, others are in view, m."""
-HELD = 10.0
-"""Fixes nearer than this hold the path whatever the trees say, m driven."""
+"""Keyframes on each side, each of which has to say so."""
+IN_VIEW = 6
+"""Trees on each side, at least."""
+STEP, VIEW = 1.5, 0.25
+"""Where more was driven unseen between two keyframes, in m and in the usual distance of a tree, others are in view."""
+FIELD = 1 / 3
+"""Share of the field of view that a sensor may turn by between two keyframes, and show the same trees."""
+HELD, SHARP = 10.0, 1.0
+"""Believed fixes within so many m driven on both sides, each known to so many m, hold the path whatever the trees say."""
 
 
-def seam(problem: Problem) -> Iterator[Finding]:
+def seam(problem: Problem, estimate: Estimate) -> Iterator[Finding]:
     """Does the run fall apart at a moment which no fixes hold together?"""
-    driven = problem.motion.distance_at(problem.stamps_ns)
-    if len(driven) < 2:
+    n, s = len(problem.stamps_ns), problem.sightings
+    if n < 2 or not len(s):
         return
-    held = driven[problem.fixes.keyframe]
-    free = np.diff(driven) < STEP
-    if len(held):
-        held = np.sort(held)
-        near = np.searchsorted(held, driven[1:])
-        before, after = held[np.maximum(near - 1, 0)], held[np.minimum(near, len(held) - 1)]
-        free &= np.minimum(np.abs(driven[1:] - before), np.abs(after - driven[1:])) > HELD
-    share, least = np.zeros(len(free)), np.full(len(free), IN_VIEW)
+    driven = problem.motion.distance_at(problem.stamps_ns)
+    step, turn = np.diff(driven), np.diff(problem.motion.turned_at(problem.stamps_ns))
+    usual = float(np.median(np.linalg.norm(s.p[:, :2], axis=1)))
+    free = (step < max(STEP, VIEW * usual)) & (turn < FIELD * _field(s.p))
+    # What is cut apart by a gap is no neighbour: as many empty keyframes lie between as are looked at.
+    row = np.arange(n) + max(REACHES) * np.concatenate([[0], np.cumsum(~free)])
+    share, chance = np.zeros(n - 1), np.zeros(n - 1)
+    least, seen = np.full(n - 1, np.inf), (np.zeros(0, np.int64),) * 2
     for reach in REACHES:
-        both, fewer = common(problem.sightings.keyframe, problem.sightings.tree, len(driven), reach)
-        share = np.maximum(share, both[1:] / np.maximum(fewer[1:], 1))
-        least = np.minimum(least, fewer[1:])
-    share = np.where(free & (least >= IN_VIEW), share, 1.0)
+        both, fewer = (x[row[1:]] for x in common(row[s.keyframe], s.tree, int(row[-1]) + 1, reach))
+        goes_on = both / np.maximum(fewer, 1)
+        enough = free & (fewer >= IN_VIEW)
+        if not enough.any():
+            return
+        usually = float(np.median(goes_on[enough]))
+        share, least = np.maximum(share, goes_on), np.minimum(least, fewer)
+        chance = np.maximum(chance, binom.cdf(both, fewer, usually) * int(enough.sum()))
+        seen = (both, fewer)
+    open_ = free & (least >= IN_VIEW) & (chance < CHANCE) & ~_held(problem, estimate, driven)
+    if not open_.any():
+        return
+    share = np.where(open_, share, 1.0)
     worst = int(np.argmin(share))
     if share[worst] < SEAM:
         seconds = (problem.stamps_ns[worst + 1] - problem.motion.stamps_ns[0]) * 1e-9
+        gyro = problem.motion.gyro
+        why = "scans were lost, the LiDAR was knocked, the recording paused" if gyro else "a turn on wheels that slip"
         yield Finding(
             name="seam", value=1.0 - float(share[worst]), bound=1.0 - SEAM, unit="",
-            sentence=f"at {seconds:.0f} s only {100 * share[worst]:.0f} % of the trees in view are seen on after it, though the robot has hardly moved: dead reckoning "
-            "broke there (a turn on slipping wheels without a gyro?), and what was mapped before and after may lie askew; an IMU or GNSS holds it together",
+            sentence=f"at {seconds:.0f} s ({driven[worst + 1]:.0f} m driven) the trees in view before and after are hardly the same ({seen[0][worst]} of {seen[1][worst]}), though "
+            f"the robot moved {step[worst]:.1f} m: dead reckoning may have broken there ({why}), and what was mapped before and after may lie askew; "
+            f"{'GNSS' if gyro else 'an IMU or GNSS'} holds it together",
         )  # fmt: skip
+
+
+def _field(p: Array) -> float:
+    """Field of view in which things are seen at (M, 3) in the robot's frame, rad: all but the widest gap of their bearings."""
+    bearing = np.sort(np.arctan2(p[:, 1], p[:, 0]))
+    return float(2.0 * np.pi - np.diff(np.append(bearing, bearing[0] + 2.0 * np.pi)).max())
+
+
+def _held(problem: Problem, estimate: Estimate, driven: Array) -> NDArray[np.bool_]:
+    """(K-1,) steps between keyframes with fixes before and after that the path believes."""
+    f = problem.fixes
+    at = transform(estimate.map_T_robot[f.keyframe], f.keyframe_p_antenna)
+    sigma = np.sqrt(f.cov[:, [0, 1], [0, 1]].max(axis=1))
+    away = np.linalg.norm((f.map_p_antenna - at)[:, :2], axis=1)
+    good = np.sort(driven[f.keyframe[(away < np.maximum(AWAY[0], AWAY[1] * sigma)) & (sigma < SHARP)]])
+    if not len(good):
+        return np.zeros(len(driven) - 1, bool)
+    before = np.searchsorted(good, driven[:-1], side="right") - 1
+    after = np.searchsorted(good, driven[1:], side="left")
+    near = (before >= 0) & (driven[:-1] - good[np.maximum(before, 0)] < HELD)
+    return np.asarray(near & (after < len(good)) & (good[np.minimum(after, len(good) - 1)] - driven[1:] < HELD))
 
 
 def common(
     keyframe: NDArray[np.int64], tree: NDArray[np.int64], keyframes: int, reach: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """For each of K `keyframes`: how many trees are seen both in the `reach` keyframes before it and in those from it on (K,), and how many are on that side
-    which shows fewer (K,). `keyframe` (M,), `tree` (M,) of each sighting. Linear in them.
+    which shows fewer (K,). `keyframe` (M,), `tree` (M,) of each sighting. Sorts them once.
     """
     pair = np.unique(tree * keyframes + keyframe)
     if not len(pair):

@@ -27,7 +27,7 @@ def audited(solved: Solved) -> Verdict:
         *audit.unsure(solved.existence.probability[_own_trees(solved)]),
         *audit.rows(solved.loops.slid),
         *audit.way(p, e),
-        *audit.seam(p),
+        *audit.seam(p, e),
         *_mounts(solved),
     ]
     if any(f.name == "moving" for f in found):  # the same cause, and said of it

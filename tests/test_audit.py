@@ -120,6 +120,9 @@ def test_fixes_that_disagree_for_half_of_a_run_are_said(share: float, said: bool
     z = p.fixes.map_p_antenna + away[:, None] * [1.0, 0.0, 0.0]
     found = list(audit.fixes(replace(p, fixes=replace(p.fixes, map_p_antenna=z)), e))
     assert bool(found) == said
+    (note,) = audit.refused_fixes(replace(p, fixes=replace(p.fixes, map_p_antenna=z)), e)
+    assert note.startswith(f"from 0 to {4 * np.ceil(share * 30):.0f} s the fixes lie 3.0")
+    assert not list(audit.refused_fixes(p, e))
 
 
 def test_refused_until_accepted() -> None:

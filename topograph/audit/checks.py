@@ -107,28 +107,49 @@ def fixes(problem: Problem, estimate: Estimate) -> Iterator[Finding]:
 
     The median of a stretch counts, not single fixes: scattered outliers point everywhere, what could be right points one way.
     """
-    f = problem.fixes
-    if len(f.keyframe) < 10:
+    if len(problem.fixes.keyframe) < 10:
         return
+    begin, off = _refused(problem, estimate)
+    far = off > 0
+    share = float(far.mean())
+    if share > UNBELIEVED:
+        yield Finding(
+            name="fixes not believed", value=share, bound=UNBELIEVED, unit="",
+            sentence=f"for {100 * share:.0f} % of the run fixes lie {float(np.median(off[far])):.2f} m from where the other fixes, wheels and trunks "
+            f"put them (from {begin[far][0]:.0f} to {begin[far][-1] + STRETCH_S:.0f} s): either part may be the right one; check the receiver's base",
+        )  # fmt: skip
+
+
+def refused_fixes(problem: Problem, estimate: Estimate) -> Iterator[str]:
+    """What to know of fixes that the rest outvoted for a while, a sentence each: they are wrong, mostly, and the path is where it is not."""
+    if len(problem.fixes.keyframe) == 0:
+        return
+    begin, off = _refused(problem, estimate)
+    far = np.concatenate([[False], off > 0, [False]])
+    for a, b in np.flatnonzero(np.diff(far)).reshape(-1, 2).tolist():
+        seconds = begin[b - 1] + STRETCH_S - begin[a]
+        if seconds >= 2 * STRETCH_S:
+            yield (
+                f"from {begin[a]:.0f} to {begin[b - 1] + STRETCH_S:.0f} s the fixes lie {float(np.median(off[a:b])):.2f} m from the path and are not believed; "
+                "if they are right, trees seen there alone are off by as much"
+            )
+
+
+def _refused(problem: Problem, estimate: Estimate) -> tuple[Array, Array]:
+    """Stretches with fixes: when they begin (S,), s, and how far the path leaves the middle of their fixes (S,), m, 0 where it believes them."""
+    f = problem.fixes
     at = transform(estimate.map_T_robot[f.keyframe], f.keyframe_p_antenna)
     away = (f.map_p_antenna - at)[:, :2]
     sigma = np.sqrt(f.cov[:, [0, 1], [0, 1]].max(axis=1))
     seconds = (problem.stamps_ns[f.keyframe] - problem.stamps_ns[0]) * 1e-9
     stretch = (seconds // STRETCH_S).astype(np.int64)
-    off, begin = [], []
+    begin, off = [], []
     for k in np.unique(stretch):
         mine = stretch == k
         middle = float(np.linalg.norm(np.median(away[mine], axis=0)))
         off.append(middle if middle > max(AWAY[0], AWAY[1] * float(np.median(sigma[mine]))) else 0.0)
         begin.append(k * STRETCH_S)
-    far = np.array(off) > 0
-    share = float(far.mean())
-    if share > UNBELIEVED:
-        yield Finding(
-            name="fixes not believed", value=share, bound=UNBELIEVED, unit="",
-            sentence=f"for {100 * share:.0f} % of the run fixes lie {float(np.median(np.array(off)[far])):.2f} m from where the other fixes, wheels and trunks "
-            f"put them (from {np.array(begin)[far][0]:.0f} to {np.array(begin)[far][-1] + STRETCH_S:.0f} s): either part may be the right one; check the receiver's base",
-        )  # fmt: skip
+    return np.array(begin), np.array(off)
 
 
 def jumps(problem: Problem, estimate: Estimate, streams: Streams, lever: Array) -> Iterator[Finding]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from topograph import audit
 from topograph.config import Config
 from topograph.estimate import Estimate, Problem, average, path_at
 from topograph.evaluate import Metric, fix_metrics
@@ -39,9 +40,13 @@ def solve_run(
 ) -> Solved:
     """`mapping.solve_session` with the settings of a whole run, and a map as it is stored."""
     old = None if known is None else known_map(known)
-    return solve_session(
+    solved = solve_session(
         run, mapping_config(config), check_fixes=check_fixes, known=old, placed=placed, progress=progress
     )
+    if placed is None:
+        said = audit.refused_fixes(solved.problem, solved.estimate)
+        run.notes.extend(n for n in said if n not in run.notes)
+    return solved
 
 
 def mapping_config(config: Config) -> MappingConfig:

@@ -122,26 +122,21 @@ def fixes(problem: Problem, estimate: Estimate) -> Iterator[Finding]:
 
 def refused_fixes(problem: Problem, estimate: Estimate) -> Iterator[str]:
     """What to know of fixes that the rest outvoted for a while, a sentence each: they are wrong, mostly, and the path is where it is not."""
-    if len(problem.fixes.keyframe) == 0:
-        return
     begin, off = _refused(problem, estimate)
     far = np.concatenate([[False], off > 0, [False]])
     for a, b in np.flatnonzero(np.diff(far)).reshape(-1, 2).tolist():
-        seconds = begin[b - 1] + STRETCH_S - begin[a]
-        if seconds >= 2 * STRETCH_S:
+        first, last = begin[a], begin[b - 1] + STRETCH_S
+        if last - first >= 2 * STRETCH_S:
             yield (
-                f"from {begin[a]:.0f} to {begin[b - 1] + STRETCH_S:.0f} s the fixes lie {float(np.median(off[a:b])):.2f} m from the path and are not believed; "
+                f"from {first:.0f} to {last:.0f} s the fixes lie {float(np.median(off[a:b])):.2f} m from the path and are not believed; "
                 "if they are right, trees seen there alone are off by as much"
             )
 
 
 def _refused(problem: Problem, estimate: Estimate) -> tuple[Array, Array]:
     """Stretches with fixes: when they begin (S,), s, and how far the path leaves the middle of their fixes (S,), m, 0 where it believes them."""
-    f = problem.fixes
-    at = transform(estimate.map_T_robot[f.keyframe], f.keyframe_p_antenna)
-    away = (f.map_p_antenna - at)[:, :2]
-    sigma = np.sqrt(f.cov[:, [0, 1], [0, 1]].max(axis=1))
-    seconds = (problem.stamps_ns[f.keyframe] - problem.stamps_ns[0]) * 1e-9
+    away, sigma = from_path(problem, estimate)
+    seconds = (problem.stamps_ns[problem.fixes.keyframe] - problem.stamps_ns[0]) * 1e-9
     stretch = (seconds // STRETCH_S).astype(np.int64)
     begin, off = [], []
     for k in np.unique(stretch):
@@ -150,6 +145,13 @@ def _refused(problem: Problem, estimate: Estimate) -> tuple[Array, Array]:
         off.append(middle if middle > max(AWAY[0], AWAY[1] * float(np.median(sigma[mine]))) else 0.0)
         begin.append(k * STRETCH_S)
     return np.array(begin), np.array(off)
+
+
+def from_path(problem: Problem, estimate: Estimate) -> tuple[Array, Array]:
+    """How far each fix lies from where the path has the antenna (F, 2), m, and its stated deviation (F,), m."""
+    f = problem.fixes
+    at = transform(estimate.map_T_robot[f.keyframe], f.keyframe_p_antenna)
+    return (f.map_p_antenna - at)[:, :2], np.sqrt(f.cov[:, [0, 1], [0, 1]].max(axis=1))
 
 
 def jumps(problem: Problem, estimate: Estimate, streams: Streams, lever: Array) -> Iterator[Finding]:

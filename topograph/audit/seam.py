@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binom
 
-from topograph.audit.checks import AWAY
+from topograph.audit.checks import AWAY, from_path
 from topograph.audit.verdict import Finding
 from topograph.estimate import Estimate, Problem
-from topograph.geometry import Array, transform
+from topograph.geometry import Array
 
 SEAM = 0.35
 """Share of the trees around a moment that are seen on both sides of it, below which they are other ones (clean: 0.72 and more in simulated runs at 5 scans
@@ -42,22 +42,16 @@ def seam(problem: Problem, estimate: Estimate) -> Iterator[Finding]:
     free = (step < max(STEP, VIEW * usual)) & (turn < FIELD * _field(s.p))
     # What is cut apart by a gap is no neighbour: as many empty keyframes lie between as are looked at.
     row = np.arange(n) + max(REACHES) * np.concatenate([[0], np.cumsum(~free)])
-    share, chance = np.zeros(n - 1), np.zeros(n - 1)
-    least, seen = np.full(n - 1, np.inf), (np.zeros(0, np.int64),) * 2
-    for reach in REACHES:
-        both, fewer = (x[row[1:]] for x in common(row[s.keyframe], s.tree, int(row[-1]) + 1, reach))
-        goes_on = both / np.maximum(fewer, 1)
-        enough = free & (fewer >= IN_VIEW)
-        if not enough.any():
-            return
-        usually = float(np.median(goes_on[enough]))
-        share, least = np.maximum(share, goes_on), np.minimum(least, fewer)
-        chance = np.maximum(chance, binom.cdf(both, fewer, usually) * int(enough.sum()))
-        seen = (both, fewer)
-    open_ = free & (least >= IN_VIEW) & (chance < CHANCE) & ~_held(problem, estimate, driven)
-    if not open_.any():
+    counts = [common(row[s.keyframe], s.tree, int(row[-1]) + 1, reach) for reach in REACHES]
+    both, fewer = np.swapaxes(counts, 0, 1)[..., row[1:]]  # (reaches, K - 1)
+    goes_on = both / np.maximum(fewer, 1)
+    enough = free & (fewer >= IN_VIEW)
+    if not enough.any(axis=1).all():
         return
-    share = np.where(open_, share, 1.0)
+    usually = np.array([[np.median(share[asked])] for share, asked in zip(goes_on, enough, strict=True)])
+    chance = binom.cdf(both, fewer, usually) * enough.sum(axis=1, keepdims=True)
+    falls_apart = (enough & (chance < CHANCE)).all(axis=0) & ~_held(problem, estimate, driven)
+    share = np.where(falls_apart, goes_on.max(axis=0), 1.0)
     worst = int(np.argmin(share))
     if share[worst] < SEAM:
         seconds = (problem.stamps_ns[worst + 1] - problem.motion.stamps_ns[0]) * 1e-9
@@ -65,7 +59,7 @@ def seam(problem: Problem, estimate: Estimate) -> Iterator[Finding]:
         why = "scans were lost, the LiDAR was knocked, the recording paused" if gyro else "a turn on wheels that slip"
         yield Finding(
             name="seam", value=1.0 - float(share[worst]), bound=1.0 - SEAM, unit="",
-            sentence=f"at {seconds:.0f} s ({driven[worst + 1]:.0f} m driven) the trees in view before and after are hardly the same ({seen[0][worst]} of {seen[1][worst]}), though "
+            sentence=f"at {seconds:.0f} s ({driven[worst + 1]:.0f} m driven) the trees in view before and after are hardly the same ({both[-1, worst]} of {fewer[-1, worst]}), though "
             f"the robot moved {step[worst]:.1f} m: dead reckoning may have broken there ({why}), and what was mapped before and after may lie askew; "
             f"{'GNSS' if gyro else 'an IMU or GNSS'} holds it together",
         )  # fmt: skip
@@ -79,11 +73,9 @@ def _field(p: Array) -> float:
 
 def _held(problem: Problem, estimate: Estimate, driven: Array) -> NDArray[np.bool_]:
     """(K-1,) steps between keyframes with fixes before and after that the path believes."""
-    f = problem.fixes
-    at = transform(estimate.map_T_robot[f.keyframe], f.keyframe_p_antenna)
-    sigma = np.sqrt(f.cov[:, [0, 1], [0, 1]].max(axis=1))
-    away = np.linalg.norm((f.map_p_antenna - at)[:, :2], axis=1)
-    good = np.sort(driven[f.keyframe[(away < np.maximum(AWAY[0], AWAY[1] * sigma)) & (sigma < SHARP)]])
+    away, sigma = from_path(problem, estimate)
+    believed = np.linalg.norm(away, axis=1) < np.maximum(AWAY[0], AWAY[1] * sigma)
+    good = np.sort(driven[problem.fixes.keyframe[believed & (sigma < SHARP)]])
     if not len(good):
         return np.zeros(len(driven) - 1, bool)
     before = np.searchsorted(good, driven[:-1], side="right") - 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from topograph.bags import Recording, Scan, StreamSurvey, Survey, Trunks, survey
 from topograph.config import Config
 from topograph.errors import FrameError, InputError
-from topograph.geometry import Array, inverse, transform
+from topograph.geometry import Array
 from topograph.motion import align_imu
 from topograph.pipeline.read import refuse_damaged
 from topograph.session import Streams, StreamsBuilder
@@ -182,16 +182,16 @@ def _points(points: Role, trunks: Role, recording: Recording, found: Survey) -> 
     place = recording.frames.get(points.stream.frame)
     from topograph.trunks.detector import heights_above_ground
     from topograph.trunks.organise import rings_of
-    from topograph.trunks.origin import seen_from
+    from topograph.trunks.origin import lidar_of, moved_back
 
-    others = {k: inverse(place) @ T for k, T in recording.frames.all().items() if k != points.stream.frame}
-    lidar = seen_from(clouds[0].xyz, others)
+    lidar = lidar_of(clouds[0], place, recording.frames.all())
     if lidar is not None:
         points.facts.append(
-            f"moved into {points.stream.frame} before: the points lie in rings about {lidar}, and are taken as seen from there"
+            f"moved into {points.stream.frame} before: the points lie in rings about {lidar[0]}, and are taken as seen from there"
         )
-        place = place @ others[lidar]
-        clouds = [replace(c, xyz=transform(inverse(others[lidar]), c.xyz).astype(np.float32)) for c in clouds]
+        place = place @ lidar[1]
+        clouds = [moved_back(c, lidar[1]) for c in clouds]
+
     ring, tangent = rings_of(clouds[0])
     order = "no ring field: rings are told by elevation"
     if clouds[0].ring is not None:

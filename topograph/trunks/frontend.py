@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 
 from topograph.bags import Imu, Odometry, Scan, Trunks
-from topograph.geometry import Array, inverse, transform
+from topograph.geometry import Array
 from topograph.motion import RecentMotion
 from topograph.trunks.config import TrunksConfig
 from topograph.trunks.detector import Detector
-from topograph.trunks.origin import LEAST, in_rings, seen_from
+from topograph.trunks.origin import LEAST, in_rings, lidar_of, moved_back
 from topograph.trunks.smear import smeared
 from topograph.trunks.thesis import ThesisDetector, ThesisTrunksConfig
 
@@ -57,7 +56,7 @@ class FrontEnd:
         self.untimed = 0
         self.notes: list[str] = []
         self._mount, self._find, self._frames = mount, find, frames
-        self._lidar_T_frame: dict[str, Array | None] = {}
+        self._frame_T_lidar: dict[str, Array | None] = {}
         self._motion = RecentMotion()
         self._imu_frame: str | None = None
         self._detect: dict[str, Detect] = {}
@@ -75,12 +74,12 @@ class FrontEnd:
 
         Where no point has a time, or nothing is known of the motion, the stated covariance is the wider for it.
         """
-        undecided = scan.frame not in self._lidar_T_frame and len(scan.xyz) >= LEAST
+        undecided = scan.frame not in self._frame_T_lidar and len(scan.xyz) >= LEAST
         if undecided or scan.frame not in self._detect:
             self._place(scan)
-        back = self._lidar_T_frame.get(scan.frame)
-        if back is not None:
-            scan = replace(scan, xyz=transform(back, scan.xyz).astype(np.float32))
+        moved = self._frame_T_lidar.get(scan.frame)
+        if moved is not None:
+            scan = moved_back(scan, moved)
         first = last = scan.stamp_ns
         timed = scan.offset is not None and bool(np.isfinite(scan.offset).any())
         if timed and scan.offset is not None:  # the sweep may lie before its stamp, after it, or around it
@@ -95,13 +94,11 @@ class FrontEnd:
     def _place(self, scan: Scan) -> None:
         """Where the scan's points were seen from: its frame, or another one about which they lie in rings. A scan of few points does not decide."""
         base_T_lidar = self._mount(scan.frame)
-        to = inverse(base_T_lidar)
-        others = {name: to @ T for name, T in self._frames().items() if name != scan.frame}
-        lidar = seen_from(scan.xyz, others)
+        lidar = lidar_of(scan, base_T_lidar, self._frames())
         if lidar is not None:
-            base_T_lidar = base_T_lidar @ others[lidar]
+            base_T_lidar = base_T_lidar @ lidar[1]
             self.notes.append(
-                f"the clouds are in {scan.frame!r} and lie in rings about {lidar!r}: taken as seen from there"
+                f"the clouds are in {scan.frame!r} and lie in rings about {lidar[0]!r}: taken as seen from there"
             )
         elif scan.ring is None and np.allclose(base_T_lidar, np.eye(4)) and not in_rings(scan.xyz):
             self.notes.append(
@@ -109,5 +106,5 @@ class FrontEnd:
                 "that is: --extrinsic lidar=X,Y,Z,ROLL,PITCH,YAW (metres, radians)"
             )
         if len(scan.xyz) >= LEAST:
-            self._lidar_T_frame[scan.frame] = None if lidar is None else inverse(others[lidar])
+            self._frame_T_lidar[scan.frame] = None if lidar is None else lidar[1]
         self._detect[scan.frame] = RIVALS[self.config.front_end](base_T_lidar, self.config, self.thesis)

@@ -1,13 +1,15 @@
-"""Where a cloud was seen from, when it was moved out of the LiDAR's frame before it was recorded and has no ring field."""
+"""Where a cloud was seen from, when it was moved out of the LiDAR's frame before it was recorded."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from topograph.geometry import Array, transform
+from topograph.bags import Scan
+from topograph.geometry import Array, inverse, transform
 
 LEAST = 2000
 """Points that show whether there are rings."""
@@ -23,14 +25,26 @@ NEAR = 0.5
 """Returns nearer to where the LiDAR may be are the robot's, or none that a driver has left at the origin, m."""
 
 
+def lidar_of(scan: Scan, base_T_frame: Array, frames: Mapping[str, Array]) -> tuple[str, Array] | None:
+    """Name and pose in the scan's frame (4, 4) of the one of the `frames`, whose poses (4, 4) in the base are known, that its points were seen from; None: its own."""
+    back = inverse(base_T_frame)
+    others = {name: back @ T for name, T in frames.items() if name != scan.frame}
+    name = seen_from(scan.xyz, others)
+    return None if name is None else (name, others[name])
+
+
+def moved_back(scan: Scan, frame_T_lidar: Array) -> Scan:
+    """The scan in the axes of the LiDAR that is at (4, 4) in its frame."""
+    return replace(scan, xyz=transform(inverse(frame_T_lidar), scan.xyz).astype(np.float32))
+
+
 def seen_from(xyz: NDArray[np.float32], frame_T_lidar: Mapping[str, Array]) -> str | None:
     """Name of the frame about which points (N, 3) lie in rings, and clearly more so than about their own, of those with poses (4, 4) in that; else None."""
-    p = np.asarray(xyz[np.isfinite(xyz).all(axis=1)], float)
     found: dict[str, float] = {}
     for name, T in frame_T_lidar.items():
-        far = p[np.linalg.norm(p - T[:3, 3], axis=1) > NEAR]
+        far = _beyond(xyz, T[:3, 3])
         if len(far) >= LEAST:
-            about = spread(transform(np.linalg.inv(T), far))
+            about = spread(transform(inverse(T), far))
             if about < min(RINGS, CLEARER * spread(far)):
                 found[name] = about
     return min(found, key=lambda k: found[k], default=None)
@@ -38,9 +52,13 @@ def seen_from(xyz: NDArray[np.float32], frame_T_lidar: Mapping[str, Array]) -> s
 
 def in_rings(xyz: NDArray[np.float32]) -> bool:
     """Whether points (N, 3) lie in rings about their own frame; True where they are too few to tell."""
-    p = np.asarray(xyz[np.isfinite(xyz).all(axis=1)], float)
-    far = p[np.linalg.norm(p, axis=1) > NEAR]
+    far = _beyond(xyz, np.zeros(3))
     return len(far) < LEAST or spread(far) < RINGS
+
+
+def _beyond(xyz: NDArray[np.float32], eye: Array) -> Array:
+    p = np.asarray(xyz[np.isfinite(xyz).all(axis=1)], float)
+    return np.asarray(p[np.linalg.norm(p - eye, axis=1) > NEAR])
 
 
 def spread(p: Array) -> float:

@@ -18,9 +18,10 @@ import woods
 from topograph import localize_bags, map_bags
 from topograph.config import Config
 from topograph.errors import InsufficientDataError
-from topograph.evaluate import Truth
+from topograph.evaluate import Truth, world_in_map
+from topograph.evaluate.localization import localization_errors
 from topograph.evaluate.metrics import match
-from topograph.geometry import from_xyz_rpy, interpolate
+from topograph.geometry import from_xyz_rpy
 from topograph.simulate import DriveConfig, SensorConfig
 from topograph.topomap import TopoMap
 from topograph.trunks import ThesisTrunksConfig, TrunksConfig
@@ -131,14 +132,12 @@ def one_wood(label: str, wood: woods.Wood, seed: int, seconds: float, config: Co
     print(f"{label:<24} {against(topo, truth, wood)}  {topo.meta['verdict']} {topo.meta['why']}", flush=True)
     replay = localize_bags(topo, bags[1], config=config)
     path = Truth.load(bags[1].with_suffix(".truth"))
-    stamps = np.array([f.stamp_ns for f in replay.fixes])
-    if not len(stamps):
+    off = np.linalg.norm(localization_errors(replay.reports, path, world_in_map(topo, path)).xy, axis=1)
+    if not len(off):
         print(f"{'':<24} never found; {replay.reports[-1].state if replay.reports else ''}", flush=True)
         return
-    true = topo.datum.to_enu(truth.datum.to_geodetic(interpolate(path.stamps_ns, path.world_T_robot, stamps)[:, :3, 3]))
-    off = np.linalg.norm(np.array([f.map_T_robot[:2, 3] for f in replay.fixes]) - true[:, :2], axis=1)
     print(
-        f"{'':<24} localized in {len(stamps) / max(len(replay.reports), 1):.2f} of the scans; mean {100 * off.mean():.1f}, 99 % {100 * np.percentile(off, 99):.1f}, worst {100 * off.max():.1f} cm",
+        f"{'':<24} localized in {len(off) / max(len(replay.reports), 1):.2f} of the scans; mean {100 * off.mean():.1f}, 99 % {100 * np.percentile(off, 99):.1f}, worst {100 * off.max():.1f} cm",
         flush=True,
     )
 
@@ -146,9 +145,8 @@ def one_wood(label: str, wood: woods.Wood, seed: int, seconds: float, config: Co
 def against(topo: TopoMap, truth: Truth, wood: woods.Wood) -> str:
     """A map's figures: trees and posts, precision within the outline, recall of what 20 scans show with 5 returns, errors at 0.8 m."""
     trees = topo.trees()
-    p, cov = trees.above_ground(CHEST)
-    at = truth.datum.to_enu(topo.datum.to_geodetic(p))[:, :2]
-    true = truth.trees[:, :2] + CHEST * truth.axes[:, :2] / truth.axes[:, 2:]
+    at, cov = at_chest(trees, truth)
+    true = stems_at_chest(truth)
     i, j = match(at, true, rec.GATE)
     rest = np.setdiff1d(np.arange(len(at)), i)
     k, _ = match(at[rest], wood.unlisted, rec.GATE)
@@ -160,7 +158,7 @@ def against(topo: TopoMap, truth: Truth, wood: woods.Wood) -> str:
     shown = (truth.returns >= 5).sum(axis=0) >= 20
     e = at[i] - true[j]
     d = np.linalg.norm(e, axis=1)
-    nees = np.einsum("ni,nij,nj->n", e, np.linalg.inv(cov[i][:, :2, :2]), e)
+    nees = np.einsum("ni,nij,nj->n", e, np.linalg.inv(cov[i]), e)
     lean = trees.axis[i, :2] / trees.axis[i, 2:] - truth.axes[j, :2] / truth.axes[j, 2:]
     thick = trees.diameter[i] - truth.diameters[j]
     false = [(*np.round(at[r], 1).tolist(), round(float(trees.kind_probability[r]), 2)) for r in rest]
@@ -169,6 +167,17 @@ def against(topo: TopoMap, truth: Truth, wood: woods.Wood) -> str:
         f"error mean {100 * d.mean():.1f} worst {100 * d.max():.1f} cm (offset {100 * e[:, 0].mean():+.1f} {100 * e[:, 1].mean():+.1f})  NEES {nees.mean():.1f}  "
         f"lean rms {np.sqrt((lean**2).mean()):.3f}  diameter {100 * thick.mean():+.1f} ± {100 * thick.std():.1f} cm"
     )
+
+
+def at_chest(trees: TopoMap, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
+    """Trees of a map at `CHEST` in the truth's frame (T, 2), m, and their covariances (T, 2, 2), m²."""
+    p, cov = trees.above_ground(CHEST)
+    return truth.datum.to_enu(trees.datum.to_geodetic(p))[:, :2], cov[:, :2, :2]
+
+
+def stems_at_chest(truth: Truth) -> np.ndarray:
+    """The truth's trees at `CHEST` (N, 2), m."""
+    return np.asarray(truth.trees[:, :2] + CHEST * truth.axes[:, :2] / truth.axes[:, 2:])
 
 
 def main() -> None:

@@ -8,7 +8,6 @@ cell of 0.2 degrees here, wider than a VLP-16's: diameters come out thicker by w
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import recordings as rec
 from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter, gaussian_filter1d
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from topograph.evaluate import Truth
@@ -37,12 +36,12 @@ TALL = 8.0
 """What is taken of a cloud, from the ground, m; a VLP-16 sees no higher within 26 m."""
 CLEAR = 0.7
 """From the robot's middle to what stands, m."""
-
-
 TOUCH = 0.3
 """From the robot's middle to what stands, m, at the least."""
 NOTHING, CAST = -2, -3
 """In the place of a tree's number: no return; the ground's, as the simulator cast it, with noise and all."""
+LOWEST = 0.03
+"""Share of a cell's points that lie below its low point."""
 LOW = 0.1
 """Points so far above the ground are the ground's, m."""
 FLATTEST = 0.02
@@ -94,13 +93,12 @@ class Wood:
         whose = np.where(above < TRACED, self.of[near], -1).astype(np.int32)  # as the simulator labels trunks
         _beams(self.points[near], whose, above < LOW, np.ascontiguousarray(world_T_lidar), angles, rank, self.tolerance, nearest, hit)  # fmt: skip
         column, laser = np.nonzero(hit != NOTHING)
-        keep = (rng.random(len(column)) > sensor.dropout) | (
-            hit[column, laser] == CAST
-        )  # the ground has had its faults
-        column, laser = column[keep], laser[keep]
-        tree, r = hit[column, laser], nearest[column, laser]
-        r = np.where(tree == CAST, r, r + rng.normal(0.0, sensor.range_sigma, len(r)))
-        tree = np.where(tree == CAST, -1, tree)
+        cast = hit[column, laser] == CAST  # with its noise and what was left out
+        keep = (rng.random(len(column)) > sensor.dropout) | cast
+        column, laser, cast = column[keep], laser[keep], cast[keep]
+        r = nearest[column, laser]
+        r = np.where(cast, r, r + rng.normal(0.0, sensor.range_sigma, len(r)))
+        tree = np.where(cast, -1, hit[column, laser])
         azimuth = -2.0 * np.pi * (column + laser / (1.5 * n)) / sensor.columns
         e = angles[laser]
         xyz = r[:, None] * np.stack([np.cos(e) * np.cos(azimuth), np.cos(e) * np.sin(azimuth), np.sin(e)], axis=1)
@@ -128,10 +126,11 @@ class Wood:
         free = step * distance_transform_edt(count < 4)
         rng = np.random.default_rng([seed, 23, run.run])
         room = np.argwhere(free > CLEAR)
+        roads = _roads(free)
         best, least = np.zeros((0, 2)), np.inf
         for _ in range(250):
             stops = room[_spread(room, int(rng.integers(3, 8)), rng)]
-            line = np.concatenate([_between(free, a, b)[:-1] for a, b in zip(stops, np.roll(stops, -1, axis=0), strict=True)])  # fmt: skip
+            line = np.concatenate([_between(roads, free.shape, a, b)[:-1] for a, b in zip(stops, np.roll(stops, -1, axis=0), strict=True)])  # fmt: skip
             xy = low + step * (gaussian_filter1d(line.astype(float), 5, axis=0, mode="wrap") + 0.5)
             ahead = np.roll(xy, -3, axis=0) - np.roll(xy, 3, axis=0)
             right = ahead[:, ::-1] * [1.0, -1.0] / np.maximum(np.hypot(*ahead.T), 1e-6)[:, None]
@@ -147,9 +146,10 @@ class Wood:
             raise ValueError("no round tour that touches nothing and has no cusp")
         return along(self.scene, np.concatenate([best] * run.laps), run)
 
-    def record(self, path: Path, seed: int, run: DriveConfig, sensor: SensorConfig, progress: Callable[[float], None] | None = None) -> Truth:  # fmt: skip
+    def record(self, path: Path, seed: int, run: DriveConfig, sensor: SensorConfig) -> Truth:
         """A bag of a drive, with its truth beside it."""
-        return record_in(path, self.scene, self.way(seed, run), seed, run, sensor, DetectionNoise(), progress, self.look)  # fmt: skip
+        way = self.way(seed, run)
+        return record_in(path, self.scene, way, seed, run, sensor, DetectionNoise(), look=self.look)
 
 
 def _spread(room: NDArray[np.int64], n: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -164,8 +164,8 @@ def _spread(room: NDArray[np.int64], n: int, rng: np.random.Generator) -> NDArra
     return np.array(chosen)[np.argsort(turn)]
 
 
-def _between(free: Array, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Cells (K, 2) of the cheapest way from a to b; what is nearer to a thing than `CLEAR` is dear."""
+def _roads(free: Array) -> csr_array:
+    """Prices of the steps between neighbouring cells of a raster that are `free` (R, C) for so many m; what is nearer to a thing than `CLEAR` is dear."""
     rows, columns = free.shape
     price = 1.0 + 40.0 * np.clip(CLEAR + 0.3 - free, 0.0, None) ** 2 + 1e3 * (free < 0.45)
     index = np.arange(rows * columns).reshape(rows, columns)
@@ -177,12 +177,18 @@ def _between(free: Array, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray
         end.append(q)
         cost.append(np.hypot(di, dj) * 0.5 * (price.ravel()[p] + price.ravel()[q]))
     g = coo_array((np.concatenate(cost), (np.concatenate(start), np.concatenate(end))), shape=(index.size, index.size))
-    _, table = dijkstra(g.tocsr(), directed=False, indices=[int(index[tuple(a)])], return_predecessors=True)
+    return g.tocsr()
+
+
+def _between(roads: csr_array, shape: tuple[int, ...], a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Cells (K, 2) of the cheapest way from a to b in a raster of that shape."""
+    start, end = (int(np.ravel_multi_index(tuple(c), shape)) for c in (a, b))
+    _, table = dijkstra(roads, directed=False, indices=[start], return_predecessors=True)
     before = table[0]
-    way = [int(index[tuple(b)])]
+    way = [end]
     while before[way[-1]] >= 0:
         way.append(int(before[way[-1]]))
-    return np.stack(np.unravel_index(way[::-1], index.shape), axis=1)
+    return np.stack(np.unravel_index(way[::-1], shape), axis=1)
 
 
 @njit(cache=True)
@@ -251,8 +257,8 @@ def _lines(plot: rec.Plot) -> tuple[Array, Array]:
     return np.column_stack([offset, ground]), axes / np.linalg.norm(axes, axis=1, keepdims=True)
 
 
-def _relief(points: Array, percentile: float = 3.0) -> Ground:
-    """The ground under a cloud: low points of cells, those that fit a plane, smoothed."""
+def _relief(points: Array) -> Ground:
+    """The ground under a cloud: a cubic surface through the low points of cells, with what those near it leave, smoothed."""
     low = points[:, :2].min(axis=0) - 2.0
     n = np.ceil((points[:, :2].max(axis=0) + 2.0 - low) / CELL).astype(int) + 1
     cell = np.rint((points[:, :2] - low) / CELL).astype(int)
@@ -260,13 +266,13 @@ def _relief(points: Array, percentile: float = 3.0) -> Ground:
     order = np.lexsort((points[:, 2], key))
     first = np.flatnonzero(np.r_[True, np.diff(key[order]) != 0])
     count = np.diff(np.r_[first, len(order)])
-    z = points[order[first + (0.01 * percentile * count).astype(int)], 2]
+    z = points[order[first + (LOWEST * count).astype(int)], 2]
     k = key[order[first]]
     x, y = 2.0 * (k % n[0]) / n[0] - 1.0, 2.0 * (k // n[0]) / n[1] - 1.0
-    w = np.ones(len(k))
+    w, A = np.ones(len(k)), _cubic(x, y)
     for _ in range(60):  # most cells hold no ground: what lies above the surface says little, what lies below much
-        surface = np.linalg.lstsq(_cubic(x, y) * w[:, None], z * w, rcond=None)[0]
-        off = z - _cubic(x, y) @ surface
+        surface = np.linalg.lstsq(A * w[:, None], z * w, rcond=None)[0]
+        off = z - A @ surface
         w = np.where(off < 0, 1.0 / np.hypot(1.0, off / 0.3), 1.0 / (1.0 + (off / 0.12) ** 2))
     good = np.abs(off) < 0.15
     weight, rest = np.zeros(n[::-1]), np.zeros(n[::-1])
@@ -283,7 +289,7 @@ def _cubic(x: Array, y: Array) -> Array:
 
 
 def plot(name: str) -> Wood:
-    """A recorded plot as it is: "pine_plot", "lpine1" or "mls_pine_plot"."""
+    """A recorded plot: "pine_plot", "lpine1" or "mls_pine_plot"."""
     if name == "mls_pine_plot":
         points, line, unlisted = _mobile()
         ground = _relief(points)

@@ -6,14 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import woods
-from evaluate_recorded import CHEST, held_out
+from evaluate_recorded import at_chest, held_out, stems_at_chest
 from recordings import DATA, GATE
 
 from topograph import localize_bags, map_bags
 from topograph.config import Config
-from topograph.evaluate import Truth
+from topograph.evaluate import Truth, world_in_map
+from topograph.evaluate.localization import localization_errors
 from topograph.evaluate.metrics import match
-from topograph.geometry import interpolate
 from topograph.simulate import DESIGNS, DriveConfig, SensorConfig, record
 from topograph.simulate.drive import Drive
 from topograph.simulate.lidar import sweep
@@ -35,21 +35,19 @@ def test_a_recorded_stand_is_mapped_and_found_again(tmp_path: Path) -> None:
     topo = map_bags(bags[0], config=config)
     truth = Truth.load(bags[0].with_suffix(".truth"))
     trees = topo.trees()
-    at, cov = trees.above_ground(CHEST)
-    at = truth.datum.to_enu(topo.datum.to_geodetic(at))[:, :2]
-    stems = truth.trees[:, :2] + CHEST * truth.axes[:, :2] / truth.axes[:, 2:]
+    at, cov = at_chest(trees, truth)
+    stems = stems_at_chest(truth)
     i, j = match(at, stems, GATE)
     assert len(j) >= len(stems) - 1
     assert len(at) - len(i) <= 1
     off = at[i] - stems[j]
     assert np.linalg.norm(off, axis=1).mean() < 0.03
-    assert np.einsum("ni,nij,nj->n", off, np.linalg.inv(cov[i, :2, :2]), off).mean() < 4.0
+    assert np.einsum("ni,nij,nj->n", off, np.linalg.inv(cov[i]), off).mean() < 4.0
     replay = localize_bags(topo, bags[1], config=config)
     assert len(replay.fixes) > 0.9 * len(replay.reports)
     path = Truth.load(bags[1].with_suffix(".truth"))
-    true = interpolate(path.stamps_ns, path.world_T_robot, np.array([f.stamp_ns for f in replay.fixes]))[:, :3, 3]
-    true = topo.datum.to_enu(truth.datum.to_geodetic(true))
-    error = np.linalg.norm([f.map_T_robot[:2, 3] for f in replay.fixes] - true[:, :2], axis=1)
+    error = np.linalg.norm(localization_errors(replay.reports, path, world_in_map(topo, path)).xy, axis=1)
+    assert len(error) == len(replay.fixes)
     assert error.mean() < 0.05
     assert error.max() < 0.15
 

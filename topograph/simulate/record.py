@@ -83,7 +83,7 @@ def record_in(
         if sensor.detections:
             streams.append(_trunks(bag, scene, way, sensor, noise, rng, run))
         else:
-            streams.append(_clouds(bag, scene, way, sensor, seed, seen, scan_stamps, run, look))
+            streams.append(_clouds(bag, scene, way, sensor, seed, seen, scan_stamps, run=run, look=look))
         span = float(way.stamps_ns[-1] - start)
         for log_ns, write in heapq.merge(*streams, key=lambda e: e[0]):
             write()

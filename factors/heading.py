@@ -40,7 +40,7 @@ def headings(
         raise ValueError("a heading must be finite and its sigma positive")
     c, s, zero = np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))
     reference = np.stack([c, s, zero], axis=1)
-    basis = bearing_basis(reference, exact=True)
+    basis = bearing_basis(reference)
     sideways, upwards = (basis * np.stack([-s, c, zero], axis=1)[:, :, None]).sum(axis=1), basis[:, 2]
     cov = sigma[:, None, None] ** 2 * sideways[:, :, None] * sideways[:, None, :]
     cov += steepest**2 * upwards[:, :, None] * upwards[:, None, :]

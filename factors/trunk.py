@@ -48,7 +48,7 @@ def trunks(
     unit = robot_p_trunk / distance[:, None]
     towards = unit if expected is None else expected / np.maximum(np.linalg.norm(expected, axis=1, keepdims=True), 1e-9)
     near = np.sum(towards * unit, axis=1) > NEAR
-    basis = bearing_basis(np.where(near[:, None], towards, unit))
+    basis = bearing_basis(np.where(near[:, None], robot_p_trunk if expected is None else expected, robot_p_trunk))
     J = np.concatenate([np.swapaxes(basis, 1, 2) / distance[:, None, None], unit[:, None, :]], axis=1)
     turned = J @ cov @ np.swapaxes(J, 1, 2)
     turned = 0.5 * (turned + np.swapaxes(turned, 1, 2))
@@ -67,15 +67,25 @@ NEAR = 0.7
 """Cosine between two directions whose tangent planes are nearly one."""
 
 
-def bearing_basis(unit: Array, *, exact: bool = False) -> Array:
-    """Tangent basis (N, 3, 2) that gtsam.Unit3 uses at directions (N, 3): across the least of the axes. `exact`: the directions are
-    those that gtsam will have, to the last bit; else rounding must not decide between equal axes.
+TIE = 1e-9
+"""Two components of a direction that are this near to each other: rounding says which is the less."""
+
+
+def bearing_basis(towards: Array) -> Array:
+    """Tangent basis (N, 3, 2) that gtsam.Unit3 uses at the directions of vectors (N, 3): across the least of the axes.
+
+    Where two axes are the least, the basis turns by 90° with the last bit of a component; there GTSAM itself is asked.
     """
-    least = np.abs(unit if exact else np.round(unit, 12)).argmin(axis=1)
-    first = np.cross(unit, np.eye(3)[least])
+    unit = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    size = np.abs(unit)
+    first = np.cross(unit, np.eye(3)[size.argmin(axis=1)])
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     second = np.cross(unit, first)
-    return np.stack([first, second / np.linalg.norm(second, axis=1, keepdims=True)], axis=2)
+    basis = np.stack([first, second / np.linalg.norm(second, axis=1, keepdims=True)], axis=2)
+    least = np.sort(size, axis=1)
+    for row in np.flatnonzero(least[:, 1] - least[:, 0] < TIE):
+        basis[row] = gtsam.Unit3(towards[row]).basis()
+    return basis
 
 
 def trunk_2d(pose_key: int, point_key: int, bearing: float, distance: float, sigma: ArrayLike, kernel: Kernel) -> Any:

@@ -3,7 +3,7 @@
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -39,6 +39,9 @@ def test_bearing_basis_is_gtsams(d: np.ndarray) -> None:
     st.floats(-0.3, 0.3),
     st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(-0.1, 0.1)),
 )
+@example(2.4e-16, 0.03125, (0.0, 0.03125, 0.0))  # as high as it is aside, but for the last bit
+@example(2.4e-16, 0.03125, (0.0, 0.03125, 1e-17))
+@example(np.pi / 2, 0.0, (0.0, 0.03, 0.0))
 def test_a_trunk_abeam_has_its_height_weighed_as_its_height(
     bearing: float, height: float, off: tuple[float, float, float]
 ) -> None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import struct
 from typing import Any
 
 import numpy as np
 
+from topograph.bags import raw as fields
 from topograph.bags.messages import Array, Fix, Heading, Imu, Odometry, Trunks
 from topograph.bags.scan import decode as decode_scan
 from topograph.geometry import from_quaternion
@@ -22,29 +22,6 @@ def stamp_of(header: Any) -> int:
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
-def _string(raw: memoryview, at: int) -> tuple[str, int]:
-    (n,) = struct.unpack_from("<I", raw, at)
-    text = bytes(raw[at + 4 : at + 4 + n]).rstrip(b"\0").decode("utf-8", "replace")
-    return text, at + 4 + n
-
-
-def _header(raw: memoryview, ros2: bool) -> tuple[int, str, int]:
-    """Stamp (ns), frame, and the offset behind a std_msgs/Header at the start of `raw`."""
-    if ros2:
-        if raw[1] != 1:
-            raise ValueError("big-endian CDR")
-        sec, nanosec = struct.unpack_from("<iI", raw, 4)
-        frame, at = _string(raw, 12)
-    else:
-        sec, nanosec = struct.unpack_from("<II", raw, 4)
-        frame, at = _string(raw, 12)
-    return sec * 1_000_000_000 + nanosec, frame.lstrip("/"), at
-
-
-def _align8(at: int) -> int:
-    return 4 + (at - 4 + 7) // 8 * 8  # CDR aligns from behind its 4-byte encapsulation header
-
-
 def unpack_imu(raw: bytes | memoryview, ros2: bool) -> Imu:
     """Imu from the bytes of a sensor_msgs/Imu (ROS 1, or little-endian CDR).
 
@@ -52,8 +29,8 @@ def unpack_imu(raw: bytes | memoryview, ros2: bool) -> Imu:
         ValueError, struct.error: the bytes are of another layout.
     """
     view = memoryview(raw)
-    stamp, frame, at = _header(view, ros2)
-    v = np.frombuffer(view, "<f8", 37, _align8(at) if ros2 else at)
+    stamp, frame, at = fields.header(view, ros2)
+    v = np.frombuffer(view, "<f8", 37, fields.aligned(at, 8, ros2))
     return Imu(stamp, frame, v[13:16].copy(), v[25:28].copy())
 
 
@@ -64,21 +41,37 @@ def unpack_odometry(raw: bytes | memoryview, ros2: bool) -> Odometry:
         ValueError, struct.error: the bytes are of another layout.
     """
     view = memoryview(raw)
-    stamp, _, at = _header(view, ros2)
-    if ros2:
-        at = 4 + (at - 4 + 3) // 4 * 4
-    child, at = _string(view, at)
-    v = np.frombuffer(view, "<f8", 85, _align8(at) if ros2 else at)
+    stamp, _, at = fields.header(view, ros2)
+    child, at = fields.string(view, fields.aligned(at, 4, ros2))
+    v = np.frombuffer(view, "<f8", 85, fields.aligned(at, 8, ros2))
     return Odometry(stamp, child.lstrip("/"), v[:7].copy(), v[43:49].copy())
 
 
 def decode_fix(m: Any) -> Fix:
-    """Fix of a sensor_msgs/NavSatFix; an unknown covariance becomes (5 m)², 10 m up."""
+    """Fix of a sensor_msgs/NavSatFix or a GPSFix (gps_common, gps_msgs); an unknown covariance becomes (5 m)², 10 m up."""
     cov = np.asarray(m.position_covariance, float).reshape(3, 3).copy()
+    status = int(m.status.status)
     if int(m.position_covariance_type) == 0:
         cov = np.diag([25.0, 25.0, 100.0])
+        across, up = getattr(m, "err_horz", 0.0), getattr(m, "err_vert", 0.0)  # of a GPSFix, at 95 %
+        if across > 0 and up > 0:
+            cov = np.diag([across, across, up]) ** 2 / 4.0
     position = np.array([m.latitude, m.longitude, m.altitude], float)
-    return Fix(stamp_of(m.header), m.header.frame_id.lstrip("/"), position, cov, int(m.status.status))
+    return Fix(stamp_of(m.header), m.header.frame_id.lstrip("/"), position, cov, _GPS_STATUS.get(status, status))
+
+
+_GPS_STATUS = {18: 1, 19: 2, 20: 1, 33: 1}
+"""What GPSStatus has beyond NavSatStatus (differential, RTK fixed, RTK float, WAAS) -> the nearest of that."""
+
+
+def decode_twist(m: Any) -> Odometry:
+    """Odometry of a TwistStamped or TwistWithCovarianceStamped in the robot's frame: a pose that never changes, and the twist."""
+    twist = m.twist.twist if hasattr(m.twist, "twist") else m.twist
+    v, w = twist.linear, twist.angular
+    still = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+    return Odometry(
+        stamp_of(m.header), m.header.frame_id.lstrip("/"), still, np.array([v.x, v.y, v.z, w.x, w.y, w.z], float)
+    )
 
 
 def decode_heading(m: Any) -> Heading:

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
-from rosbags.typesys import Stores, get_typestore
 
-from topograph.bags import decode, topics
+from topograph.bags import decode, packets, topics
 from topograph.bags.clocks import Clocks, Message
 from topograph.bags.config import BagsConfig
+from topograph.bags.definitions import typestore
 from topograph.bags.frames import Frames
 from topograph.bags.messages import Fix, Heading, Imu, Odometry, Trunks
 from topograph.bags.salvage import Salvaged, SalvagedFolder, why_unreadable
@@ -81,11 +81,17 @@ class Recording:
         self._counting = True
         self._readers: list[Reader] = []
         self._stack = ExitStack()
+        self._velodyne: packets.Velodyne | None = None
 
     @property
     def moved_by_lidar(self) -> bool:
         """Whether the motion is to come from the point clouds."""
         return self.config.topic_odometry == topics.FROM_LIDAR and "points" in self.chosen
+
+    def to_name(self, kind: str) -> list[str]:
+        """Topics that could be the stream, but only when they are named."""
+        named = topics.KINDS[kind].named
+        return sorted(t for t, typ in self.types.items() if typ in named and self.counts[t])
 
     def __enter__(self) -> Self:
         try:
@@ -142,7 +148,7 @@ class Recording:
             link = self._folder() / "recording.db3"
             link.symlink_to(path.resolve())
             path = link
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader = AnyReader([path], default_typestore=typestore(ros1=False))
         reader.open()
         if not all(isinstance(c.topic, str) and isinstance(c.msgtype, str) for c in reader.connections):
             reader.close()
@@ -251,8 +257,7 @@ class Recording:
             product = self._product(kind, self._readers[i], connection, raw)
             fields: tuple[str, ...] = ()
             if isinstance(product, Scan) and seen[kind] == every:
-                message: Any = self._readers[i].deserialize(raw, connection.msgtype)
-                fields = tuple(f.name for f in message.fields)
+                fields = self._fields(self._readers[i], connection, raw)
             yield kind, log_ns, product, fields
         self.given = Counter({k: seen[k] for k in wanted.values()})
         for topic, kind in wanted.items():
@@ -340,20 +345,25 @@ class Recording:
             if kind == "imu":
                 return self._finite_imu(decode.unpack_imu(raw, reader.is2))
             if kind == "odometry":
-                odometry = decode.unpack_odometry(raw, reader.is2)
+                told = typ in topics.KINDS["odometry"].found
+                odometry = (
+                    decode.unpack_odometry(raw, reader.is2)
+                    if told
+                    else decode.decode_twist(reader.deserialize(raw, typ))
+                )
                 turn = np.abs(odometry.odom_T_child[3:]).max()
                 if not _sane(odometry.odom_T_child) or not _sane(odometry.twist) or turn < decode.SHORTEST:
                     self._count(f"odometry: {INFINITE}")
                     return None
                 return odometry
-            message: Any = reader.deserialize(raw, typ)
             if kind == "points":
-                scan = decode_scan(message, decode.stamp_of(message.header))
+                scan = self._scan(reader, typ, raw)
                 finite = np.isfinite(scan.xyz)
                 if not (finite[:, 0] & finite[:, 1] & finite[:, 2]).any():
                     self._count(f"points: {EMPTY}")
                     return None
                 return scan
+            message: Any = reader.deserialize(raw, typ)
             if kind == "fix":
                 return decode.decode_fix(message)
             if kind == "heading":
@@ -372,6 +382,24 @@ class Recording:
             self.undecoded.setdefault(kind, str(err) or type(err).__name__)
             log.debug("%s: %s", connection.topic, err)
             return None
+
+    def _scan(self, reader: Reader, typ: str, raw: Any) -> Scan:
+        if typ == packets.VELODYNE:
+            self._velodyne = self._velodyne or packets.Velodyne()
+            return self._velodyne(raw, reader.is2)
+        if typ in packets.LIVOX:
+            return packets.unpack_livox(raw, reader.is2)
+        message: Any = reader.deserialize(raw, typ)
+        return decode_scan(message, decode.stamp_of(message.header))
+
+    def _fields(self, reader: Reader, connection: Connection, raw: Any) -> tuple[str, ...]:
+        """Names of what a point has."""
+        if connection.msgtype == packets.VELODYNE:
+            return ("x", "y", "z", "intensity", "ring", "time")
+        if connection.msgtype in packets.LIVOX:
+            return ("x", "y", "z", "reflectivity", "tag", "line", "offset_time")
+        message: Any = reader.deserialize(raw, connection.msgtype)
+        return tuple(f.name for f in message.fields)
 
     def _count(self, reason: str) -> None:
         self.skipped[reason] += self._counting

@@ -15,6 +15,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from topograph.bags.blocks import Channel, Entry, blocks_of
+from topograph.bags.definitions import typestore
 from topograph.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -177,7 +178,7 @@ def _typestore(channels: Collection[Channel]) -> Typestore:
         except Exception as err:  # noqa: BLE001  # a damaged definition costs its topic, which then cannot be decoded
             log.info("the definition of %s is damaged (%r)", c.msgtype, err)
     if not any(c.definition for c in channels):
-        return get_typestore(Stores.ROS2_HUMBLE)
+        return typestore(ros1=False)
     store = get_typestore(Stores.EMPTY)
     store.register(types)
     return store

@@ -16,16 +16,13 @@ from topograph.geometry import Array
 CLOUDS = 5
 """Of a recording are decoded, spread over it."""
 RAW = {
-    "velodyne_msgs/msg/VelodyneScan": "velodyne_pointcloud's transform node",
     "ouster_ros/msg/PacketMsg": "ouster_ros's replay launch file",
     "ouster_sensor_msgs/msg/PacketMsg": "ouster_ros's replay launch file",
     "hesai_ros_driver/msg/UdpFrame": "hesai_ros_driver with its packet topic as source",
     "pandar_msgs/msg/PandarScan": "hesai's pandar_pointcloud",
-    "livox_ros_driver/msg/CustomMsg": "livox_ros_driver with xfer_format 0, or a converter of CustomMsg",
-    "livox_ros_driver2/msg/CustomMsg": "livox_ros_driver2 with xfer_format 0, or a converter of CustomMsg",
     "rslidar_msg/msg/RslidarPacket": "rslidar_sdk with its packet topic as source",
 }
-"""Packets of LiDARs as they came over the wire -> what makes PointCloud2 of them."""
+"""Packets of LiDARs that are not read (bags/packets.py has those that are) -> what makes PointCloud2 of them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

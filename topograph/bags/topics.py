@@ -3,21 +3,49 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from topograph.bags.config import BagsConfig
+from topograph.bags.packets import LIVOX, VELODYNE
 from topograph.errors import TopicError
 
-KINDS: dict[str, tuple[str, ...]] = {
-    "points": ("sensor_msgs/msg/PointCloud2",),
-    "trunks": ("vision_msgs/msg/Detection3DArray", "pcl_processing/msg/ClusterArray"),
-    "odometry": ("nav_msgs/msg/Odometry",),
-    "imu": ("sensor_msgs/msg/Imu",),
-    "fix": ("sensor_msgs/msg/NavSatFix",),
-    "heading": (
-        "sensor_msgs/msg/Imu",
-        "geometry_msgs/msg/QuaternionStamped",
-        "geometry_msgs/msg/PoseStamped",
-        "geometry_msgs/msg/PoseWithCovarianceStamped",
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """Message types of a stream.
+
+    Attributes:
+        found: a topic of these is taken for the stream.
+        instead: where there is none of `found`.
+        named: taken only when the topic is named: they may be something else (a command, a velocity in another frame).
+    """
+
+    found: tuple[str, ...]
+    instead: tuple[str, ...] = ()
+    named: tuple[str, ...] = ()
+
+    @property
+    def all(self) -> tuple[str, ...]:
+        """Every type that the stream can be read from."""
+        return (*self.found, *self.instead, *self.named)
+
+
+KINDS: dict[str, Accepted] = {
+    "points": Accepted(("sensor_msgs/msg/PointCloud2",), instead=(VELODYNE, *LIVOX)),
+    "trunks": Accepted(("vision_msgs/msg/Detection3DArray", "pcl_processing/msg/ClusterArray")),
+    "odometry": Accepted(
+        ("nav_msgs/msg/Odometry",),
+        named=("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped"),
+    ),
+    "imu": Accepted(("sensor_msgs/msg/Imu",)),
+    "fix": Accepted(("sensor_msgs/msg/NavSatFix",), instead=("gps_common/msg/GPSFix", "gps_msgs/msg/GPSFix")),
+    "heading": Accepted(
+        (
+            "sensor_msgs/msg/Imu",
+            "geometry_msgs/msg/QuaternionStamped",
+            "geometry_msgs/msg/PoseStamped",
+            "geometry_msgs/msg/PoseWithCovarianceStamped",
+        )
     ),
 }
 
@@ -38,9 +66,9 @@ def choose(types: Mapping[str, str], config: BagsConfig) -> dict[str, str]:
         if wanted == "none" or (kind == "odometry" and wanted == FROM_LIDAR):
             continue
         if wanted:
-            chosen[kind] = _named(kind, wanted, accepted, types)
+            chosen[kind] = _named(kind, wanted, accepted.all, types)
             continue
-        fitting = sorted(t for t, typ in types.items() if typ in accepted and _fits(kind, t, typ))
+        fitting = _fitting(kind, accepted.found, types) or _fitting(kind, accepted.instead, types)
         if kind == "trunks" and "points" in chosen:
             continue  # clouds are the better source; a recorded trunk topic is taken when it is named
         if len(fitting) > 1:
@@ -51,6 +79,10 @@ def choose(types: Mapping[str, str], config: BagsConfig) -> dict[str, str]:
     if config.topic_trunks not in ("", "none") and not config.topic_points:
         chosen.pop("points", None)
     return chosen
+
+
+def _fitting(kind: str, accepted: tuple[str, ...], types: Mapping[str, str]) -> list[str]:
+    return sorted(t for t, typ in types.items() if typ in accepted and _fits(kind, t, typ))
 
 
 def _fits(kind: str, topic: str, typ: str) -> bool:

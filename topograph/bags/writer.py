@@ -12,25 +12,10 @@ from typing import Any, Self, cast
 import numpy as np
 from numpy.typing import NDArray
 from rosbags import rosbag1, rosbag2
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from topograph.bags.definitions import typestore
 from topograph.errors import InputError
 from topograph.geometry import Array, to_quaternion
-
-_EXTRA = {
-    "tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms",
-    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score",
-    "vision_msgs/msg/ObjectHypothesisWithPose": "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose",
-    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
-    "vision_msgs/msg/Detection3D": (
-        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
-        "vision_msgs/BoundingBox3D bbox\nstring id"
-    ),
-    "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
-    "pcl_processing/msg/Cluster": "uint32 num_points\ngeometry_msgs/Point centroid\nsensor_msgs/PointCloud2 cloud",
-    "pcl_processing/msg/ClusterArray": "std_msgs/Header header\npcl_processing/Cluster[] clusters",
-}
-
 
 CYLINDER, LINE_LIST, TEXT = 3, 5, 9
 """Of visualization_msgs/Marker."""
@@ -58,10 +43,7 @@ class BagWriter:
             raise InputError(f"{path}: exists already; remove it or choose another name")
         self._remove()
         self._part.parent.mkdir(parents=True, exist_ok=True)
-        self._store = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.ROS2_HUMBLE)
-        for name, text in _EXTRA.items():
-            types = get_types_from_msg(text, name)
-            self._store.register({k: v for k, v in types.items() if k not in self._store.types})
+        self._store = typestore(ros1=self._ros1)
         if self._ros1:
             self._writer: Any = rosbag1.Writer(self._part)
             if compression == "lz4":

@@ -116,7 +116,8 @@ def _common(role: Role, recording: Recording, found: Survey) -> None:
     """Rate, gaps, clock and place of a stream."""
     s = role.stream
     if s is None:
-        role.missing = MISSING[role.kind]
+        options = " or ".join(f"--topic-{role.kind} {t}" for t in recording.to_name(role.kind))
+        role.missing = MISSING[role.kind] + (f"; if it is measured, in the robot's frame: {options}" if options else "")
         return
     gap, at = s.longest_gap(recording.duration_s)
     if gap > max(GAP[role.kind], SILENT_STEPS / max(s.rate_hz, 1e-3)):

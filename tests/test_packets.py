@@ -1,7 +1,7 @@
 """What drivers record before clouds are made, and messages that recordings hold no definitions of."""
 
 import sqlite3
-from dataclasses import fields
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -202,9 +202,7 @@ def test_humble_leaves_no_definitions(tmp_path: Path) -> None:
     )  # fmt: skip
     gps = s["gps_msgs/msg/GPSFix"]
     numbers = {
-        f: 0.0
-        for f in (f.name for f in fields(gps))
-        if f not in ("header", "status", "position_covariance", "__msgtype__")
+        f: 0.0 for f in signature(gps).parameters if f not in ("header", "status", "position_covariance", "__msgtype__")
     }
     numbers |= {"latitude": 40.0, "longitude": -8.0, "altitude": 100.0, "err_horz": 0.04, "err_vert": 0.08}
     fix = gps(header=at, status=status, position_covariance=np.zeros(9), **(numbers | {"position_covariance_type": 0}))

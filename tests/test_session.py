@@ -7,10 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from topograph.bags import Imu, Odometry, Trunks
-from topograph.session import SECTORS, Scans, ScansBuilder, StreamsBuilder
+from topograph.geometry import exp, inverse, to_quaternion
+from topograph.session import SECTORS, Driven, Scans, ScansBuilder, StreamsBuilder
 from topograph.session.scans import SCANS_AT_ONCE
 from topograph.trees import Detections
 
+T0 = 1_700_000_000_000_000_000
 FIELDS = ("p", "axis", "diameter", "cov", "height", "score", "kinds", "measured", "stems", "free", "eye")
 
 
@@ -127,3 +129,49 @@ def test_streams_are_put_in_order_and_repetitions_counted(messages: list[tuple[i
         if kept:
             frame = "child" if kind else "imu"
             assert streams.frames[frame] == f"{frame}{kept[0][1]}"
+
+
+@given(st.integers(0, 10**6), st.integers(3, 40), st.floats(0.2, 2.0))
+def test_wheels_that_tell_twists_alone_are_driven(seed: int, n: int, speed: float) -> None:
+    """A circle ends where the closed form says, for a whole run and message by message, wherever the pose stands still."""
+    rng = np.random.default_rng(seed)
+    ns = T0 + np.cumsum(rng.integers(20_000_000, 90_000_000, n))
+    twist = np.tile([speed, 0.0, 0.0, 0.0, 0.0, rng.uniform(-0.8, 0.8)], (n, 1))
+    still = exp(rng.normal(0, 1, 6))
+    pose = np.concatenate([still[:3, 3], to_quaternion(still)])
+    builder, live = StreamsBuilder(), Driven()
+    for k in range(n):
+        m = Odometry(int(ns[k]), "base_link", pose, twist[k])
+        builder.add(m)
+        last = live(m)
+    streams = builder.build(Counter())
+    seconds = (ns[-1] - ns[0]) * 1e-9
+    expected = still @ exp(twist[0, [3, 4, 5, 0, 1, 2]] * seconds)
+    np.testing.assert_allclose(streams.odom_T_child[-1], expected, atol=1e-9)
+    if speed * seconds > 0.05:
+        np.testing.assert_allclose(last, expected, atol=1e-9)
+
+
+@given(st.integers(0, 10**6), st.integers(0, 5), st.floats(-1.0, 1.0))
+def test_wheels_that_tell_poses_are_taken_at_their_word(seed: int, standing: int, wrong: float) -> None:
+    """Whatever their twists say; they may stand at first, and the steps between poses are as told."""
+    rng = np.random.default_rng(seed)
+    steps = exp(rng.normal(0, 0.05, (12, 6)))
+    poses = [exp(rng.normal(0, 1, 6))] * (standing + 1)
+    for s in steps:
+        poses.append(poses[-1] @ s)
+    twist = np.tile([wrong, 0.0, 0.0, 0.0, 0.0, 0.0], (len(poses), 1))
+    twist[: standing + 1] = 0.0
+    builder, live = StreamsBuilder(), Driven()
+    given_poses = []
+    for k, T in enumerate(poses):
+        m = Odometry(T0 + k * 50_000_000, "base_link", np.concatenate([T[:3, 3], to_quaternion(T)]), twist[k])
+        builder.add(m)
+        given_poses.append(live(m))
+    np.testing.assert_allclose(builder.build(Counter()).odom_T_child, poses, atol=1e-9)
+    out = np.array(given_poses)
+    told = np.array(poses)
+    late = slice(standing + 2, None)  # twists that are wrong may have moved it before the first pose that changed
+    np.testing.assert_allclose(
+        inverse(out[:-1])[late] @ out[1:][late], inverse(told[:-1])[late] @ told[1:][late], atol=1e-9
+    )

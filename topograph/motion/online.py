@@ -17,6 +17,7 @@ from topograph.motion.gravity_kernel import gravity_kernel
 from topograph.motion.inertial import GRAVITY
 from topograph.motion.samples import RANGE
 from topograph.motion.steps import jumps, levelled, quaternion_of, straightened
+from topograph.session import Driven
 
 AHEAD_NS = 2_000_000_000
 """A message that is further ahead of its stream waits for one that agrees: then there was a gap, or the clock was set."""
@@ -128,6 +129,7 @@ class Reckoner:
         self._sample: tuple[int, Array, Array] | None = None  # the last one integrated
         self._at_ns: int | None = None
         self._against = Against()
+        self._driven = Driven()
         self._late: dict[str, int] = {}
         self._ahead: dict[str, Any] = {}
         self._newest: dict[str, int] = {}
@@ -143,8 +145,8 @@ class Reckoner:
                 for sample in self._in_time("imu", (message.stamp_ns, message.gyro, message.accel), self._sample):
                     insort(self._imu, sample, key=_stamp)
         elif np.abs(message.odom_T_child).max() < FARTHEST and np.linalg.norm(message.odom_T_child[3:]) > 0.5:
-            pose = from_quaternion(message.odom_T_child[:3], message.odom_T_child[3:])
-            for heard in self._in_time("wheels", (message.stamp_ns, pose @ self.child_T_robot), self._heard):
+            odom_T_robot = self._driven(message) @ self.child_T_robot
+            for heard in self._in_time("wheels", (message.stamp_ns, odom_T_robot), self._heard):
                 insort(self._wheels, heard, key=_stamp)
 
     def _in_time(self, kind: str, message: _M, last: tuple[int, Any] | tuple[int, Any, Any] | None) -> list[_M]:

@@ -10,7 +10,6 @@ from scipy.ndimage import gaussian_filter1d
 from topograph.geometry import (
     Array,
     Stamps,
-    exp,
     from_quaternion,
     interpolate,
     inverse,
@@ -159,14 +158,10 @@ def _stands_still(streams: Streams, step: Array) -> bool:
 
 
 def _steps(streams: Streams, child_T_robot: Array) -> Array:
-    """Motion (O-1, 4, 4) of the base between odometry's messages; from their twists where their poses never change."""
+    """Motion (O-1, 4, 4) of the base between odometry's messages."""
     odom_T_robot = streams.odom_T_child @ child_T_robot
     dt = np.diff(streams.odometry_ns) * 1e-9
     step = inverse(odom_T_robot[:-1]) @ odom_T_robot[1:]
-    still = np.abs(streams.odom_T_child - streams.odom_T_child[0]).max() < 1e-6
-    if still and np.abs(streams.twist).max() > 0.05:  # some drivers fill in the twist alone
-        twist = 0.5 * (streams.twist[:-1] + streams.twist[1:])[:, [3, 4, 5, 0, 1, 2]] * np.minimum(dt, 0.5)[:, None]
-        step = inverse(child_T_robot) @ exp(twist) @ child_T_robot
     return _without_jumps(step, dt)
 
 

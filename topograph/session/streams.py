@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from topograph.bags import Fix, Heading, Imu, Odometry
 from topograph.geometry import Array, Datum, Stamps, from_quaternion
 from topograph.session.columns import Column, rising
+from topograph.session.driven import driven
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,7 +20,8 @@ class Streams:
     """All of a run but its scans; each block is sorted by stamp and may be empty.
 
     Attributes:
-        odometry_ns, odom_T_child, twist: (O,), (O, 4, 4), (O, 6) linear (m/s), angular (rad/s).
+        odometry_ns, odom_T_child, twist: (O,), (O, 4, 4), (O, 6) linear (m/s), angular (rad/s). Where the driver fills in the twist
+            alone, the poses are integrated from it.
         imu_ns, gyro, accel: (I,), (I, 3) rad/s, (I, 3) m/s², in the IMU's frame.
         fix_ns, lat_lon_h, fix_cov, fix_status: (F,), (F, 3), (F, 3, 3) m², (F,).
         heading_ns, heading, heading_sigma: (H,), (H,) rad, (H,) rad or NaN.
@@ -115,9 +117,10 @@ class StreamsBuilder:
         headings = _in_order(self.headings, "heading", skipped)
         frames = {name: stream.frame for name, stream in (("child", self.odometry), ("imu", self.imu)) if len(stream)}
         frames |= {name: few[0].frame for name, few in (("fix", fixes), ("heading", headings)) if few}
+        poses = from_quaternion(moved[:, :3], moved[:, 3:7]) if len(moved) else np.zeros((0, 4, 4))
         return Streams(
             odometry_ns=odometry_ns,
-            odom_T_child=from_quaternion(moved[:, :3], moved[:, 3:7]) if len(moved) else np.zeros((0, 4, 4)),
+            odom_T_child=driven(odometry_ns, poses, moved[:, 7:]),
             twist=moved[:, 7:].copy(),
             imu_ns=imu_ns,
             gyro=felt[:, :3].copy(),

@@ -231,3 +231,30 @@ def test_a_second_stem_is_believed_where_trees_fork() -> None:
     assert among.place_var[1] > alone.place_var[1] + 0.01**2
     assert (among.stems[2:10] == 2).all()
     assert (alone.stems[1:] == 1).all()
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.3, 0.5])
+def test_something_beside_a_trunk_that_is_taken_for_it_is_in_the_covariance(apart: float) -> None:
+    """Most sightings of a trunk are of a heap beside it, or of both: the mean of them is wherever, and must say so. Sightings that
+    scatter as they state add nothing.
+    """
+    rng = np.random.default_rng(11)
+    trees, scans, stated = 60, 40, 0.02
+    poses = around(scans)
+    scan = np.tile(np.arange(scans), trees)
+    tree = np.repeat(np.arange(trees), scans)
+    side = rng.uniform(0, 2 * np.pi, trees)[tree]
+    of_heap = rng.random(len(tree)) < 0.7
+    heap = apart * np.stack([np.cos(side), np.sin(side)], axis=1) + rng.normal(0, 0.4 * apart, (len(tree), 2))
+    place = rng.normal(0, stated, (len(tree), 2)) + of_heap[:, None] * heap
+    order = np.argsort(scan, kind="stable")
+    d = sighted(poses, place[order], np.zeros((len(tree), 2)), tree[order], scan[order], np.ones(len(tree), np.int64))
+    s = shapes(d, tree[order], poses, trees)
+    sigma = np.sqrt(s.place_var)
+    if apart == 0.0:
+        assert sigma.max() < stated
+        return
+    off = np.array([np.median(place[tree == t], axis=0) for t in range(trees)])  # the trunk stands at the origin
+    nees = np.sum(off**2, axis=1) / s.place_var
+    assert 0.3 < nees.mean() < 8.0
+    assert np.median(sigma) > 0.2 * apart

@@ -86,6 +86,7 @@ BREAKS = [
     Break("sightings count as independent", T + "trees/sightings.py", "independent: float = 0.25", "independent: float = 1.0", NUMBERS + " -k 'alike'"),
     Break("clock of scans has the other sign", T + "estimate/offsets.py", "mount[:, :, 0] = -s.late", "mount[:, :, 0] = s.late", P + "test_audit.py"),
     Break("existence ignores what should be seen", T + "trees/existence.py", "ok &= _shown_often(scan[anew], which[anew], p[anew], seen[anew], hits, n, config)", "pass", NUMBERS + " -k 'clutter'"),
+    Break("scatter says nothing", T + "trees/shape.py", "places.variance() + blurred", "places.variance()", P + "test_shape.py"),
     Break("views never disagree", T + "trees/shape.py", "out.place_var[:] = places.variance()", "out.place_var[:] = 0.0 * places.variance()", P + "test_shape.py"),
     Break("lever arm sign in assemble", T + "estimate/assemble.py", "lever = transform(keyframe_T_robot, robot_T_antenna[:3, 3])", "lever = transform(keyframe_T_robot, -robot_T_antenna[:3, 3])", NUMBERS + " -k 'right'"),
     Break("heading baseline turned by 90 degrees", T + "estimate/assemble.py", "robot_T_baseline[:3, 0]", "robot_T_baseline[:3, 1]", NUMBERS + " -k 'sound'"),

@@ -27,6 +27,11 @@ VIEW_SIGMA, VIEW_LEAN = 0.006, 0.015
 """Disagreement of views that is there before any was seen: of places, m, and of slopes, rad."""
 BEND = 0.008
 """A trunk's axis below what was seen is not the axis seen, rad."""
+CHI2_MEDIAN = 1.386
+"""Median of a squared distance in a plane, per variance of an axis."""
+SCATTER = 2.0
+"""Of the stated variance, that the scatter of a trunk's sightings may be: it is 0.2 to 0.6 of it for trunks that stand by themselves
+(simulated and recorded), 4 to 12 for those that something leans on."""
 FORK = 0.4
 """Height above ground at which the stems of one tree are taken to part, m."""
 APART = 0.2
@@ -58,7 +63,7 @@ class Shapes:
         diameter: (T,) m or NaN; `diameter_sigma` (T,).
         height: (T,) above ground of the point that the sightings state, m.
         stems: (T,) as counted; `forked` (T,) where the sightings state the fork.
-        place_var: (T,) of the axis at that height, from how far views from different sides disagree, m².
+        place_var: (T,) of the axis at that height, from how far views from different sides disagree, and sightings scatter, m².
         own_slope: (N, 2) slope of the stem that each of the N sightings saw, where its tree has several; else NaN.
     """
 
@@ -109,6 +114,7 @@ def shapes(
     trust = d.believed / np.maximum(d.sigma**2, 1e-6)
     places, slopes = _Views(n, VIEW_SIGMA), _Views(n, VIEW_LEAN)
     forked = _forked_probability(_told(d, order, ends))
+    blurred = np.zeros(n)
     for j in range(n):
         mine = order[ends[j] : ends[j + 1]]
         if not len(mine):
@@ -130,12 +136,22 @@ def shapes(
             out.slope_var[j] = 1.0 / (v.sum() + 1.0 / LEAN_PRIOR**2)
             slopes.add(j, slope[mine] - out.slope[j], v, views[mine])
             place = middle[mine] + lever[mine, None] * out.slope[j]
-        places.add(j, place - np.median(place, axis=0), trust[mine], views[mine])
+        place = place - np.median(place, axis=0)
+        places.add(j, place, trust[mine], views[mine])
+        blurred[j] = _blurred(place, d.sigma[mine])
     single = ~out.forked
     out.slope_var[single] = np.minimum(out.slope_var + BEND**2 + slopes.variance(), LEAN_PRIOR**2)[single]
     if measured:  # recorded detections are all spread that way, and the graph learns how far
-        out.place_var[:] = places.variance() + np.where(single, forked, 0.0) * (FORK * FORKED_LEAN) ** 2
+        out.place_var[:] = places.variance() + blurred + np.where(single, forked, 0.0) * (FORK * FORKED_LEAN) ** 2
     return out
+
+
+def _blurred(place: Array, sigma: Array) -> float:
+    """Variance, m² an axis, of a tree whose sightings, `place` (M, 2) about their median, scatter further than `sigma` (M,) has them: a log
+    or a bush beside the trunk is taken for it from some sides, and which of them is the tree no average tells.
+    """
+    away = np.sum(place**2, axis=1)
+    return max(float(np.median(away) - SCATTER * np.median(sigma**2) * CHI2_MEDIAN), 0.0) / CHI2_MEDIAN
 
 
 def _places(d: Detections, map_T_scan: Array) -> tuple[Array, Array, Array]:

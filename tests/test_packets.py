@@ -1,4 +1,4 @@
-"""What drivers record before clouds are made, and messages that recordings hold no definitions of."""
+"""What drivers record before clouds are made, messages that recordings hold no definitions of, and compressed files."""
 
 import sqlite3
 from inspect import signature
@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from packets import convert, livox_message, packets_of, store_of, velodyne_message
@@ -16,6 +17,7 @@ from topograph.bags import BagsConfig, Fix, Odometry, Recording, Scan, Trunks
 from topograph.bags.definitions import typestore
 from topograph.bags.packets import Velodyne, unpack_livox
 from topograph.bags.topics import choose
+from topograph.bags.writer import BagWriter
 from topograph.config import Config
 from topograph.errors import InputError, TopicError
 from topograph.pipeline import read_run, solve_run, topo_map
@@ -223,6 +225,52 @@ def test_humble_leaves_no_definitions(tmp_path: Path) -> None:
     assert got["fix"].status == 2  # RTK
     assert isinstance(got["odometry"], Odometry)
     np.testing.assert_allclose(got["odometry"].twist, [1.5, 0, 0, 0, 0, 0.3])
+
+
+@pytest.mark.parametrize("plugin", [rosbag2.StoragePlugin.MCAP, rosbag2.StoragePlugin.SQLITE3])
+@pytest.mark.parametrize("mode", [rosbag2.CompressionMode.FILE, rosbag2.CompressionMode.MESSAGE])
+def test_compressed_recordings_need_no_metadata(
+    tmp_path: Path, plugin: rosbag2.StoragePlugin, mode: rosbag2.CompressionMode
+) -> None:
+    """As folders, as lone files, and without the metadata.yaml that a robot without power never wrote."""
+    store = typestore(ros1=False)
+    point = store.types["geometry_msgs/msg/Vector3"](x=0.5, y=0.0, z=0.0)
+    twist = store.types["geometry_msgs/msg/Twist"](linear=point, angular=point)
+    writer = rosbag2.Writer(tmp_path / "run", version=8, storage_plugin=plugin)
+    writer.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
+    with writer as w:
+        c = w.add_connection("/wheels", "geometry_msgs/msg/TwistStamped", typestore=store)
+        for k in range(20):
+            m = store.types["geometry_msgs/msg/TwistStamped"](header=header(store, False, T0 + k * 10**7), twist=twist)
+            w.write(c, T0 + k * 10**7, serialized(store, False, m))
+    config = BagsConfig(topic_odometry="/wheels")
+    (file,) = (p for p in (tmp_path / "run").iterdir() if p.suffix != ".yaml")
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    (bare / file.name).write_bytes(file.read_bytes())
+    for path in (tmp_path / "run", file, bare):
+        with Recording([path], config) as r:
+            assert len(list(r.messages())) == 20
+            assert not r.skipped
+            assert not r.notes
+
+
+def test_a_compressed_file_that_was_cut_gives_what_is_whole(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    with BagWriter(tmp_path / "run") as w:
+        for k in range(4000):
+            w.imu("/imu", T0 + k * 10**7, T0 + k * 10**7, "imu", rng.normal(size=3), rng.normal(size=3))
+    (file,) = (tmp_path / "run").glob("*.mcap")
+    packed = zstandard.ZstdCompressor().compress(file.read_bytes())
+    (tmp_path / "cut.mcap.zstd").write_bytes(packed[: len(packed) * 2 // 3])
+    with Recording([tmp_path / "cut.mcap.zstd"]) as r:
+        assert 1000 < len(list(r.messages())) < 4000
+        assert "truncated" in r.notes[0]
+    with pytest.raises(InputError, match="--strict"), Recording([tmp_path / "cut.mcap.zstd"], BagsConfig(strict=True)):
+        pass
+    (tmp_path / "none.mcap.zstd").write_bytes(b"no zstd")
+    with pytest.raises(InputError, match="nothing of it can be decompressed"), Recording([tmp_path / "none.mcap.zstd"]):
+        pass
 
 
 def mapped(path: Path) -> TopoMap:

@@ -16,6 +16,7 @@ from types import TracebackType
 from typing import Any, Self, cast
 
 import numpy as np
+import zstandard
 from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
@@ -37,6 +38,8 @@ log = logging.getLogger(__name__)
 UNDECODED = "cannot be decoded"
 INFINITE = "not finite"
 EMPTY = "no point in it"
+ZSTD = b"\x28\xb5\x2f\xfd"
+"""What a compressed message of ROS 2 begins with; one that is not begins with a zero."""
 DAMAGED = "announced by the recording's index, not in the file (damaged)"
 
 Reader = AnyReader | Salvaged | SalvagedFolder
@@ -139,6 +142,8 @@ class Recording:
         """The file by its index; raises whatever the readers' libraries do on damage."""
         if path.suffix == ".active":
             raise ValueError("it was never closed")
+        if path.suffix == ".zstd":
+            path = self._inflated(path)
         beside = [q for q in side_files(path) if q.stat().st_size]
         if beside:
             if self.config.strict:
@@ -158,6 +163,20 @@ class Recording:
     def _folder(self) -> Path:
         return Path(self._stack.enter_context(TemporaryDirectory(prefix="topograph-")))
 
+    def _inflated(self, path: Path) -> Path:
+        """A file of `ros2 bag record --compression-mode file`, as it was before, in a folder of its own for as long as it is read."""
+        inflated = self._folder() / path.stem
+        with path.open("rb") as packed, inflated.open("wb") as out:
+            try:
+                zstandard.ZstdDecompressor().copy_stream(packed, out)
+            except zstandard.ZstdError as err:
+                if self.config.strict:
+                    raise
+                log.info(
+                    "%s: damaged (%r)", path, err
+                )  # what is whole is read, what is missing is told by the file in it
+        return inflated
+
     def _joined(self, path: Path, beside: Sequence[Path]) -> Path:
         """A copy of an SQLite file with what its journal holds: SQLite would write it into the recording itself."""
         copy = self._folder() / "recording.db3"
@@ -176,9 +195,17 @@ class Recording:
         except Exception as err:  # noqa: BLE001  # whatever the readers' libraries raise on damage; told below
             return self._salvage(path, err)
 
+    def _salvaged(self, path: Path) -> Salvaged:
+        if path.suffix != ".zstd":
+            return Salvaged(path)
+        inflated = self._inflated(path)
+        if not inflated.stat().st_size:
+            raise InputError(f"{path}: nothing of it can be decompressed; restore a copy of it")
+        return Salvaged(inflated)
+
     def _salvage(self, path: Path, err: Exception) -> Salvaged:
         """What is whole in the file."""
-        saved = Salvaged(path)
+        saved = self._salvaged(path)
         lost = f"not read: {saved.lost}" if saved.lost else "nothing else was found in it"
         self.notes.append(
             f"{path.name}: truncated, damaged or of an unusual kind ({str(err) or type(err).__name__}): {saved.message_count} messages "
@@ -310,6 +337,10 @@ class Recording:
                 for connection, log_ns, raw in reader.messages(connections=found, start=last, stop=stop):
                     if not isinstance(log_ns, int):  # a row of SQLite may hold anything
                         raise TypeError(f"time of recording {log_ns!r}")
+                    if (
+                        reader.is2 and bytes(raw[:4]) == ZSTD
+                    ):  # message by message, which only metadata.yaml would have told
+                        raw = zstandard.ZstdDecompressor().decompress(raw)
                     if log_ns == last and given[connection.topic]:
                         given[connection.topic] -= 1
                         at_last[connection.topic] += 1
@@ -329,7 +360,7 @@ class Recording:
                     self.skipped[f"rest of {self.paths[i].name}: damaged"] += window_ns is not None
                     return
                 path = self.paths[i]
-                saved = SalvagedFolder(recordings_in(path)) if path.is_dir() else Salvaged(path)
+                saved = SalvagedFolder(recordings_in(path)) if path.is_dir() else self._salvaged(path)
                 self._stack.callback(saved.close)
                 self._readers[i] = saved
                 at = ((last or self.start_ns) - self.start_ns) * 1e-9
@@ -449,7 +480,12 @@ _RECORDING = {".bag", ".mcap", ".db3"}
 
 def recordings_in(folder: Path) -> list[Path]:
     """The recordings' files in a folder; those of one run are its parts."""
-    return sorted(p for p in folder.iterdir() if p.is_file() and p.suffix in {*_RECORDING, ".active"})
+    return sorted(p for p in folder.iterdir() if p.is_file() and (p.suffix in {*_RECORDING, ".active"} or _packed(p)))
+
+
+def _packed(path: Path) -> bool:
+    """Compressed as a whole by ROS 2."""
+    return path.suffix == ".zstd" and Path(path.stem).suffix in {".mcap", ".db3"}
 
 
 def side_files(path: Path) -> list[Path]:

@@ -29,9 +29,9 @@ BEND = 0.008
 """A trunk's axis below what was seen is not the axis seen, rad."""
 CHI2_MEDIAN = 1.386
 """Median of a squared distance in a plane, per variance of an axis."""
-SCATTER = 2.0
-"""Of the stated variance, that the scatter of a trunk's sightings may be: it is 0.2 to 0.6 of it for trunks that stand by themselves
-(simulated and recorded), 4 to 12 for those that something leans on."""
+SCATTER = 3.0
+"""Times the stated variance, that of a trunk's sightings may be: it is 0.2 to 0.6 of it for trunks that stand by themselves, up to 3 for
+lobed ones and in thickets (both simulated and recorded), 4 to 12 for those that something leans on (recorded)."""
 FORK = 0.4
 """Height above ground at which the stems of one tree are taken to part, m."""
 APART = 0.2

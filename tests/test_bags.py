@@ -208,6 +208,26 @@ def test_a_stream_on_its_own_clock_is_laid_onto_the_others(tmp_path: Path, stamp
     assert not r.skipped
 
 
+@pytest.mark.parametrize("stamp", [lambda s: s + 1000 - T0 * 1e-9, lambda s: -T0 * 1e-9])
+@pytest.mark.parametrize("first", [0.0, -0.1])
+def test_sweeps_on_their_own_clock_were_complete_when_they_arrived(tmp_path: Path, stamp, first: float) -> None:
+    """Stamped at their first point or at their last: it is the last that was measured just before the arrival."""
+    view = points(np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4")]))
+    view["time"] = first + np.linspace(0.0, 0.1, len(view))
+    with BagWriter(tmp_path / "a.bag") as w:
+        for k in range(100):
+            end = T0 + k * 10**8
+            w.odometry("/odom", end + 2 * 10**6, end, ("odom", "base_link"), np.eye(4), np.zeros(6))
+            w.imu("/imu", end + 10**6, end, "imu", np.zeros(3), np.ones(3))
+            header = T0 + int(stamp(0.1 * k - (0.1 + first)) * 1e9)
+            w.points("/points", end + 3 * 10**6, header, "lidar", view)
+    with Recording([tmp_path / "a.bag"]) as r:
+        got = [m for kind, m in r.messages() if kind == "points"]
+    last = [m.stamp_ns + float(m.offset.max()) * 1e9 - T0 - k * 10**8 for k, m in enumerate(got)]
+    assert len(got) == 100
+    assert np.abs(last).max() < 5_000_000
+
+
 def test_a_clock_that_runs_ahead_is_told(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "a.bag") as w:
         for k in range(200):

@@ -164,6 +164,15 @@ def test_packets_are_taken_where_there_are_no_clouds() -> None:
     assert choose(packets | clouds, BagsConfig(topic_points="/velodyne_packets"))["points"] == "/velodyne_packets"
 
 
+@pytest.mark.parametrize("clouds", [["/camera/depth/points"], ["/cloud_registered", "/Laser_map"]])
+def test_packets_are_an_option_beside_clouds_of_something_else(clouds: list[str]) -> None:
+    """A depth camera, or the map of an odometry that had the LiDAR: neither is taken without being asked for."""
+    types = {"/livox/lidar": "livox_ros_driver2/msg/CustomMsg"} | dict.fromkeys(clouds, "sensor_msgs/msg/PointCloud2")
+    with pytest.raises(TopicError, match="--topic-points /livox/lidar"):
+        choose(types, BagsConfig())
+    assert choose(types, BagsConfig(topic_points="/livox/lidar"))["points"] == "/livox/lidar"
+
+
 def test_a_twist_is_odometry_when_it_is_named() -> None:
     types = {"/vel": "geometry_msgs/msg/TwistStamped"}
     assert "odometry" not in choose(types, BagsConfig())  # it may be a command, or GNSS's velocity in ENU

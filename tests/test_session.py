@@ -3,6 +3,7 @@
 from collections import Counter
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -131,25 +132,73 @@ def test_streams_are_put_in_order_and_repetitions_counted(messages: list[tuple[i
             assert streams.frames[frame] == f"{frame}{kept[0][1]}"
 
 
-@given(st.integers(0, 10**6), st.integers(3, 40), st.floats(0.2, 2.0))
-def test_wheels_that_tell_twists_alone_are_driven(seed: int, n: int, speed: float) -> None:
-    """A circle ends where the closed form says, for a whole run and message by message, wherever the pose stands still."""
+def told_by(ns: np.ndarray, poses: np.ndarray, twists: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Poses of a whole run, and of the same messages one by one."""
+    builder, live, out = StreamsBuilder(), Driven(), []
+    for stamp, T, twist in zip(ns.tolist(), poses, twists, strict=True):
+        builder.add(Odometry(stamp, "base_link", np.concatenate([T[:3, 3], to_quaternion(T)]), twist))
+        out.append(live(stamp, T, twist))
+    return builder.build(Counter()).odom_T_child, np.array(out)
+
+
+FILLED = ("nothing", "orientation", "all", "all, but late")
+
+
+@given(st.integers(0, 10**6), st.integers(10, 60), st.floats(0.2, 2.0), st.floats(-0.8, 0.8), st.sampled_from(FILLED))
+def test_what_wheels_do_not_fill_in_is_driven(seed: int, n: int, speed: float, rate: float, filled: str) -> None:
+    """A circle ends where the closed form says, for a whole run and message by message, whatever part of the pose stands still."""
     rng = np.random.default_rng(seed)
-    ns = T0 + np.cumsum(rng.integers(20_000_000, 90_000_000, n))
-    twist = np.tile([speed, 0.0, 0.0, 0.0, 0.0, rng.uniform(-0.8, 0.8)], (n, 1))
-    still = exp(rng.normal(0, 1, 6))
-    pose = np.concatenate([still[:3, 3], to_quaternion(still)])
-    builder, live = StreamsBuilder(), Driven()
-    for k in range(n):
-        m = Odometry(int(ns[k]), "base_link", pose, twist[k])
-        builder.add(m)
-        last = live(m)
-    streams = builder.build(Counter())
-    seconds = (ns[-1] - ns[0]) * 1e-9
-    expected = still @ exp(twist[0, [3, 4, 5, 0, 1, 2]] * seconds)
-    np.testing.assert_allclose(streams.odom_T_child[-1], expected, atol=1e-9)
-    if speed * seconds > 0.05:
-        np.testing.assert_allclose(last, expected, atol=1e-9)
+    ns = T0 + np.concatenate([[0], np.cumsum(rng.integers(20_000_000, 90_000_000, n - 1))])
+    twist = np.tile([speed, 0.0, 0.0, 0.0, 0.0, rate], (n, 1))
+    start = exp(rng.normal(0, 1, 6))
+    moved = exp(twist[:, [3, 4, 5, 0, 1, 2]] * ((ns - T0) * 1e-9)[:, None])
+    told = start @ moved
+    if filled in ("nothing", "orientation"):
+        told[:, :3, 3] = start[:3, 3]
+    if filled == "nothing":
+        told[:, :3, :3] = start[:3, :3]
+    if filled == "all, but late":
+        late = int(rng.integers(1, n))
+        told[late:] = start @ inverse(moved[late - 1]) @ moved[late:]
+        told[:late] = start
+    whole, live = told_by(ns, told, twist)
+    np.testing.assert_allclose(whole, live, atol=1e-9)
+    np.testing.assert_allclose(
+        inverse(whole[0]) @ whole[-1], moved[-1], atol=0.021 if filled == "all, but late" else 1e-9
+    )
+
+
+@given(st.integers(0, 10**6), st.floats(-0.02, 0.02), st.floats(-0.02, 0.02))
+def test_wheels_that_stand_do_not_creep(seed: int, creep: float, bias: float) -> None:
+    """However long, though a gyro in the wheels' driver has a bias."""
+    ns = T0 + np.arange(200) * 50_000_000
+    rng = np.random.default_rng(seed)
+    twist = np.tile([creep, 0.0, 0.0, 0.0, 0.0, bias], (200, 1)) + rng.normal(0, 0.005, (200, 6))
+    pose = exp(rng.normal(0, 1, 6))
+    for out in told_by(ns, np.tile(pose, (200, 1, 1)), twist):
+        np.testing.assert_allclose(out[-1], pose, atol=0.02)
+
+
+@given(st.integers(0, 10**6), st.integers(2, 9))
+def test_twists_that_overtake_each_other_are_driven_once(seed: int, every: int) -> None:
+    """Messages that are late, doubled, or no numbers do not add to the way; a clock that is set back goes on."""
+    n = 100
+    ns = T0 + np.arange(n) * 50_000_000
+    order = np.arange(n)
+    order[every - 1 :: every][:-1], order[every::every][: len(order[every - 1 :: every][:-1])] = (
+        order[every::every][: len(order[every - 1 :: every][:-1])].copy(),
+        order[every - 1 :: every][:-1].copy(),
+    )
+    live, still = Driven(), exp(np.random.default_rng(seed).normal(0, 1, 6))
+    twist = np.array([1.0, 0, 0, 0, 0, 0])
+    for k in order.tolist():
+        out = live(int(ns[k]), still, twist)
+    assert np.linalg.norm(out[:3, 3] - still[:3, 3]) == pytest.approx((n - 1) * 0.05, abs=0.06)
+    live(int(ns[-1]) + 50_000_000, still, np.full(6, np.nan))
+    after = live(int(ns[-1]) + 100_000_000, still, twist)
+    assert np.isfinite(after).all()
+    back = [live(T0 - 3_600_000_000_000 + k * 50_000_000, still, twist) for k in range(21)]
+    assert np.linalg.norm(back[-1][:3, 3] - back[0][:3, 3]) == pytest.approx(1.0, abs=1e-6)
 
 
 @given(st.integers(0, 10**6), st.integers(0, 5), st.floats(-1.0, 1.0))
@@ -167,7 +216,7 @@ def test_wheels_that_tell_poses_are_taken_at_their_word(seed: int, standing: int
     for k, T in enumerate(poses):
         m = Odometry(T0 + k * 50_000_000, "base_link", np.concatenate([T[:3, 3], to_quaternion(T)]), twist[k])
         builder.add(m)
-        given_poses.append(live(m))
+        given_poses.append(live(m.stamp_ns, T, m.twist))
     np.testing.assert_allclose(builder.build(Counter()).odom_T_child, poses, atol=1e-9)
     out = np.array(given_poses)
     told = np.array(poses)

@@ -13,6 +13,8 @@ from itertools import chain, pairwise
 from statistics import median
 from typing import Protocol
 
+import numpy as np
+
 BUFFER_NS = 3_000_000_000
 """Of recording are read before the first message is given: enough to know each stream's clock."""
 ODD_NS = 2_000_000_000
@@ -44,6 +46,12 @@ class Message:
     kind: str
     log_ns: int
     product: Stamped
+
+
+def _reach(messages: Iterable[Message]) -> int:
+    """How long after its stamp a message's last point was measured, ns: a sweep is not sent before it is complete."""
+    last = [offset for m in messages if (offset := getattr(m.product, "offset", None)) is not None]
+    return int(median(max(float(np.nanmax(o)), 0.0) for o in last) * 1e9) if last else 0
 
 
 @dataclass(slots=True)
@@ -115,7 +123,7 @@ class Clocks:
         for kind, v in middle.items():
             s = self._streams[kind]
             if abs(v - self._common) > ODD_NS:
-                s.shift = self._common - v
+                s.shift = self._common - v - _reach(by[kind])
                 self.notes.append(
                     f"{kind}: its stamps are of another clock ({-s.shift * 1e-9:+.0f} s from the others): laid onto theirs by its "
                     "arrival, which is late by the unknown time of transport"
@@ -140,7 +148,7 @@ class Clocks:
         distance = stamp - m.log_ns
         if not s.usual:  # a stream that begins late
             if abs(distance - self._common) > ODD_NS:
-                s.shift = self._common - distance
+                s.shift = self._common - distance - _reach([m])
                 self.notes.append(f"{m.kind}: its stamps are of another clock: laid onto the others by its arrival")
             s.usual.append(distance)
         usual = int(median(s.usual))
@@ -186,7 +194,8 @@ class Clocks:
         note = f"{m.kind}: no header stamps: the time of recording stands in, which is late by the unknown time of transport"
         if note not in self.notes:
             self.notes.append(note)
-        yield Message(m.kind, m.log_ns, replace(m.product, stamp_ns=m.log_ns + self._common))  # type: ignore[type-var]  # products are dataclasses
+        stamp = m.log_ns + self._common - _reach([m])
+        yield Message(m.kind, m.log_ns, replace(m.product, stamp_ns=stamp))  # type: ignore[type-var]  # products are dataclasses
 
     def _moved(self, m: Message, shift: int) -> Message:
         if not shift:

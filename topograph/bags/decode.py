@@ -44,7 +44,11 @@ def unpack_odometry(raw: bytes | memoryview, ros2: bool) -> Odometry:
     stamp, _, at = fields.header(view, ros2)
     child, at = fields.string(view, fields.aligned(at, 4, ros2))
     v = np.frombuffer(view, "<f8", 85, fields.aligned(at, 8, ros2))
-    return Odometry(stamp, child.lstrip("/"), v[:7].copy(), v[43:49].copy())
+    pose, twist = v[:7].copy(), v[43:49].copy()
+    if not pose.any():  # ROS 1's default: not filled in
+        pose[6] = 1.0
+    twist[1:5][np.isnan(twist[1:5])] = 0.0  # nobody drives sideways, and few tell
+    return Odometry(stamp, child.lstrip("/"), pose, twist)
 
 
 def decode_fix(m: Any) -> Fix:

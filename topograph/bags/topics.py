@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -16,7 +17,7 @@ class Accepted:
 
     Attributes:
         found: a topic of these is taken for the stream.
-        instead: where there is none of `found`.
+        instead: where there is none of `found`, or as one of the options where it is not clear that they come from one sensor.
         named: taken only when the topic is named: they may be something else (a command, a velocity in another frame).
     """
 
@@ -68,7 +69,10 @@ def choose(types: Mapping[str, str], config: BagsConfig) -> dict[str, str]:
         if wanted:
             chosen[kind] = _named(kind, wanted, accepted.all, types)
             continue
-        fitting = _fitting(kind, accepted.found, types) or _fitting(kind, accepted.instead, types)
+        fitting, instead = (_fitting(kind, those, types) for those in (accepted.found, accepted.instead))
+        if fitting and not all(_of_one_sensor(kind, fitting, t) for t in instead):
+            fitting = [*fitting, *instead]  # a depth camera's cloud, or the map of a program that had the LiDAR
+        fitting = fitting or instead
         if kind == "trunks" and "points" in chosen:
             continue  # clouds are the better source; a recorded trunk topic is taken when it is named
         if len(fitting) > 1:
@@ -83,6 +87,16 @@ def choose(types: Mapping[str, str], config: BagsConfig) -> dict[str, str]:
 
 def _fitting(kind: str, accepted: tuple[str, ...], types: Mapping[str, str]) -> list[str]:
     return sorted(t for t, typ in types.items() if typ in accepted and _fits(kind, t, typ))
+
+
+def _of_one_sensor(kind: str, topics: list[str], other: str) -> bool:
+    """The topics are of the sensor of the `other`, only further processed: /velodyne_points and /velodyne_packets. One receiver publishes its
+    fixes in several messages, whatever they are called."""
+    return kind == "fix" or any(_first_word(t) == _first_word(other) for t in topics)
+
+
+def _first_word(topic: str) -> str:
+    return re.split(r"[/_]", topic.lstrip("/"), maxsplit=1)[0].lower()
 
 
 def _fits(kind: str, topic: str, typ: str) -> bool:

@@ -145,9 +145,12 @@ class Reckoner:
                 for sample in self._in_time("imu", (message.stamp_ns, message.gyro, message.accel), self._sample):
                     insort(self._imu, sample, key=_stamp)
         elif np.abs(message.odom_T_child).max() < FARTHEST and np.linalg.norm(message.odom_T_child[3:]) > 0.5:
-            odom_T_robot = self._driven(message) @ self.child_T_robot
-            for heard in self._in_time("wheels", (message.stamp_ns, odom_T_robot), self._heard):
-                insort(self._wheels, heard, key=_stamp)
+            pose = from_quaternion(message.odom_T_child[:3], message.odom_T_child[3:])
+            for stamp_ns, odom_T_child, twist in self._in_time(
+                "wheels", (message.stamp_ns, pose, message.twist), self._heard
+            ):
+                odom_T_robot = self._driven(stamp_ns, odom_T_child, twist) @ self.child_T_robot
+                insort(self._wheels, (stamp_ns, odom_T_robot), key=_stamp)
 
     def _in_time(self, kind: str, message: _M, last: tuple[int, Any] | tuple[int, Any, Any] | None) -> list[_M]:
         """The message, if it is newer than the last one that was used and not far ahead of those that came; many older ones in a row

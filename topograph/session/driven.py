@@ -1,64 +1,93 @@
-"""Poses of wheels whose driver fills in the twist alone: for a whole run, and message by message."""
+"""Poses of wheels whose driver fills in the twist alone, or part of the pose: for a whole run, and message by message."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from topograph.bags import Odometry
-from topograph.geometry import Array, exp, from_quaternion, inverse
+from topograph.geometry import Array, exp, inverse
 
 SAME = 1e-6
 """Poses that differ by less are one, m and per unit of a rotation's matrix."""
 MOVES = 0.05
-"""Faster than so many m/s or rad/s is moving."""
+"""Twists below so many m/s and rad/s are noise of wheels that stand, or the bias of a gyro in them."""
 LONGEST_S = 0.5
-"""A twist says nothing of what comes later."""
+"""A twist says nothing of what comes later; a stamp that is older by more is of a clock that was set back."""
 TOLD = 0.02
-"""So many m or rad by the twists, and the pose has not changed: it never will."""
+"""So many m or rad by the twists, and the position (or the orientation) is what it was at first: it is not filled in."""
 
 
 def driven(stamps_ns: NDArray[np.int64], odom_T_child: Array, twist: Array) -> Array:
-    """Poses (N, 4, 4) as told; integrated from the twists (N, 6), linear and angular, where the poses never change and the twists do."""
-    if not len(odom_T_child) or np.abs(odom_T_child - odom_T_child[0]).max() >= SAME or np.abs(twist).max() <= MOVES:
+    """Poses (N, 4, 4) as told, or as `Driven` makes them of the twists (N, 6), linear and angular."""
+    if len(odom_T_child) < 2 or not _needed(stamps_ns, odom_T_child, twist):
         return odom_T_child
+    live = Driven()
+    return np.array([live(*m) for m in zip(stamps_ns.tolist(), odom_T_child, twist, strict=True)])
+
+
+def _needed(stamps_ns: NDArray[np.int64], odom_T_child: Array, twist: Array) -> bool:
+    """The twists tell of motion before the position, or the orientation, has changed for the first time."""
     steps = _steps(0.5 * (twist[:-1] + twist[1:]), np.diff(stamps_ns) * 1e-9)
-    out = np.empty_like(odom_T_child)
-    out[0] = odom_T_child[0]
-    for k, step in enumerate(steps):
-        out[k + 1] = out[k] @ step
-    return out
+    for part, size in ((np.s_[:, :3, :3], _angle(steps)), (np.s_[:, :3, 3], np.linalg.norm(steps[:, :3, 3], axis=1))):
+        changed = np.abs(odom_T_child[part] - odom_T_child[part][0]).reshape(len(odom_T_child), -1).max(axis=1) >= SAME
+        first = int(changed.argmax()) if changed.any() else len(changed)
+        if size[: max(first - 1, 0)].sum() > TOLD:
+            return True
+    return False
 
 
 class Driven:
-    """The same as the messages come. Until a pose has changed, what the twists say is kept; a pose that does change is believed from then
-    on, and goes on from where the robot was."""
+    """The poses as the messages come. As long as the position has not changed, the twists' velocity is kept beside it, and stands in once
+    that comes to `TOLD`; the same of the orientation. What does change is believed from then on, and goes on from where the robot was.
+    """
 
     def __init__(self) -> None:
-        self._first: Array | None = None
-        self._last: tuple[int, Array] | None = None  # stamp and twist
-        self._by_twist = np.eye(4)  # since the first message
-        self._told: Array | None = None  # what takes told poses to those given; None: they have not changed yet
+        self._first = np.eye(4)
+        self._last: tuple[int, Array, Array] | None = None  # stamp, pose as told, twist
+        self._made = np.eye(4)  # the pose with what is not filled in taken from the twists
+        self._turned, self._moved = 0.0, 0.0  # by the twists, while orientation and position did not change: rad, m
+        self._turns, self._travels = False, False  # they have changed
+        self._stands_in = False
+        self._offset: Array | None = None  # of told poses, once both have changed
 
-    def __call__(self, m: Odometry) -> Array:
-        """Pose (4, 4) of a message, of a child frame that moves smoothly."""
-        pose = from_quaternion(m.odom_T_child[:3], m.odom_T_child[3:])
-        if self._told is not None:
-            return np.asarray(self._told @ pose)
-        if self._first is None:
-            self._first = pose
-        if self._last is not None and m.stamp_ns > self._last[0]:
-            mean, dt = 0.5 * (self._last[1] + m.twist), (m.stamp_ns - self._last[0]) * 1e-9
-            if np.isfinite(mean).all():
-                self._by_twist = self._by_twist @ _steps(mean[None], np.array([dt]))[0]
-        self._last = (m.stamp_ns, m.twist)
-        moved = float(np.abs(self._by_twist - np.eye(4)).max()) > TOLD
-        given = self._first @ self._by_twist if moved else self._first
-        if np.abs(pose - self._first).max() >= SAME:
-            self._told = given @ inverse(pose) if moved else np.eye(4)
-            return np.asarray(self._told @ pose)
-        return np.asarray(given)
+    def __call__(self, stamp_ns: int, told: Array, twist: Array) -> Array:
+        """Pose (4, 4) of a message with the pose `told` (4, 4) and a twist (6,), of a child frame that moves smoothly."""
+        if self._offset is not None:
+            return np.asarray(self._offset @ told)
+        if self._last is None:
+            self._first = self._made = told
+            self._last = (stamp_ns, told, twist)
+            return told
+        last_ns, before, twist_before = self._last
+        dt = (stamp_ns - last_ns) * 1e-9
+        if -LONGEST_S < dt <= 0:  # overtaken on its way
+            return self._made if self._stands_in else told
+        self._last = (stamp_ns, told, twist)
+        self._go(inverse(before) @ told, _steps(0.5 * (twist_before + twist)[None], np.array([max(dt, 0.0)]))[0], told)
+        return self._made if self._stands_in else told
+
+    def _go(self, told_step: Array, twist_step: Array, told: Array) -> None:
+        self._turns = self._turns or bool(np.abs(told[:3, :3] - self._first[:3, :3]).max() >= SAME)
+        self._travels = self._travels or bool(np.abs(told[:3, 3] - self._first[:3, 3]).max() >= SAME)
+        step = told_step.copy()
+        if not self._turns:
+            self._turned += float(_angle(twist_step[None])[0])
+            step[:3, :3] = twist_step[:3, :3]
+        if not self._travels:
+            self._moved += float(np.linalg.norm(twist_step[:3, 3]))
+            step[:3, 3] = twist_step[:3, 3]
+        self._made = self._made @ step
+        self._stands_in = self._stands_in or self._turned > TOLD or self._moved > TOLD
+        if self._turns and self._travels:
+            self._offset = self._made @ inverse(told) if self._stands_in else np.eye(4)
 
 
 def _steps(twist: Array, dt: Array) -> Array:
-    return exp(twist[:, [3, 4, 5, 0, 1, 2]] * np.minimum(dt, LONGEST_S)[:, None])
+    """Motion (N, 4, 4) of mean twists (N, 6) over `dt` (N,) s; none where they are noise, or no numbers."""
+    moves = (np.abs(twist).max(axis=1) > MOVES) & np.isfinite(twist).all(axis=1)
+    return exp(np.where(moves[:, None], twist[:, [3, 4, 5, 0, 1, 2]], 0.0) * np.minimum(dt, LONGEST_S)[:, None])
+
+
+def _angle(steps: Array) -> Array:
+    """(N,) rad, of small rotations."""
+    return np.asarray(np.linalg.norm(steps[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(2.0))

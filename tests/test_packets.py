@@ -120,10 +120,9 @@ def test_a_livox_message_is_the_sweep(seed: int, n: int, ros1: bool, frame: str,
         p.tag = t
     keep = ((tags & 3) != 1) & ((tags >> 2 & 3) != 1)
     message.points.append(type(message.points[0])(offset_time=0, x=0.0, y=0.0, z=0.0, reflectivity=0, tag=0, line=0))
-    got = unpack_livox(serialized(store, ros1, message), not ros1)
+    got, _ = unpack_livox(serialized(store, ros1, message), not ros1)
     np.testing.assert_array_equal(got.xyz, scan.xyz[keep])
-    assert scan.ring is not None
-    np.testing.assert_array_equal(got.ring, scan.ring[keep])
+    assert got.ring is None  # a line is no ring: it wanders over the whole view
     assert (got.stamp_ns, got.frame) == (T0, frame)
     if keep.sum() > 1:
         assert got.offset is not None
@@ -134,9 +133,56 @@ def test_a_livox_clock_that_began_with_the_sensor_counts_from_the_stamp() -> Non
     scan = turn(3, 4, 0.0)
     store = store_of(True)
     message = livox_message(store, header(store, True, T0), scan, base_ns=7_000_000_000)
-    offset = unpack_livox(serialized(store, True, message), False).offset
+    offset = unpack_livox(serialized(store, True, message), False)[0].offset
     assert offset is not None
     assert offset[0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_two_livox_on_one_topic_are_told_apart(tmp_path: Path) -> None:
+    """Their clouds are in frames of their own, of which the topic names one."""
+    store = store_of(True)
+    with rosbag1.Writer(tmp_path / "a.bag") as w:
+        c = w.add_connection("/livox/lidar", "livox_ros_driver/msg/CustomMsg", typestore=store)
+        for k in range(10):
+            at = T0 + k * 50_000_000
+            message = livox_message(store, header(store, True, at), turn(k, 20, 0.0))
+            message.lidar_id = 3 + k % 2
+            w.write(c, at, serialized(store, True, message))
+    with Recording([tmp_path / "a.bag"]) as r:
+        assert len(list(r.messages())) == 5
+        assert r.skipped == {"points: of a second LiDAR on one topic": 5}
+        assert any("lidar_id 3" in n for n in r.notes)
+
+
+@pytest.mark.parametrize("dual", [False, True])
+def test_both_returns_of_a_beam_have_its_direction_and_time(dual: bool) -> None:
+    """A packet of dual returns holds each firing twice, the last return and the strongest, over half the time."""
+    scan = turn(5, 24, 40.0)
+    store = store_of(True)
+    message = velodyne_message(store, header(store, True, T0), scan)
+    once = message.packets[0].data
+    if dual:
+        blocks = once[:1200].reshape(12, 100)
+        further = blocks.copy()
+        for c in range(32):  # a metre behind, in units of 2 mm
+            distance = further[:, 4 + 3 * c : 6 + 3 * c].copy().view("<u2")
+            further[:, 4 + 3 * c : 6 + 3 * c] = np.where(distance > 0, distance + 500, 0).astype("<u2").view(np.uint8)
+        tail = np.array([*once[1200:1204], 0x39, once[1205]], np.uint8)
+        halves = [np.stack([blocks[k : k + 6], further[k : k + 6]], axis=1).reshape(-1) for k in (0, 6)]
+        message.packets = [
+            type(message.packets[0])(message.packets[0].stamp, np.concatenate([h, tail])) for h in halves
+        ]
+        later = int.from_bytes(once[1200:1204].tobytes(), "little") + round(12 * FIRING_S * 1e6)
+        message.packets[1].data[1200:1204] = np.frombuffer(later.to_bytes(4, "little"), np.uint8)
+    got = Velodyne()(serialized(store, True, message), False)
+    assert len(got.xyz) == len(scan.xyz) * (1 + dual)
+    assert got.offset is not None
+    assert scan.offset is not None
+    assert np.ptp(got.offset) == pytest.approx(np.ptp(scan.offset), abs=3e-6)
+    if dual:
+        assert np.linalg.norm(got.xyz, axis=1).max() - np.linalg.norm(scan.xyz, axis=1).max() == pytest.approx(
+            1.0, abs=0.02
+        )
 
 
 @pytest.mark.parametrize("kind", ["velodyne", "livox"])

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from topograph.bags import raw as fields
+from topograph.bags import raw as layout
 from topograph.bags.messages import Array, Fix, Heading, Imu, Odometry, Trunks
 from topograph.bags.scan import decode as decode_scan
 from topograph.geometry import from_quaternion
@@ -29,8 +29,8 @@ def unpack_imu(raw: bytes | memoryview, ros2: bool) -> Imu:
         ValueError, struct.error: the bytes are of another layout.
     """
     view = memoryview(raw)
-    stamp, frame, at = fields.header(view, ros2)
-    v = np.frombuffer(view, "<f8", 37, fields.aligned(at, 8, ros2))
+    stamp, frame, at = layout.header(view, ros2)
+    v = np.frombuffer(view, "<f8", 37, layout.aligned(at, 8, ros2))
     return Imu(stamp, frame, v[13:16].copy(), v[25:28].copy())
 
 
@@ -41,9 +41,9 @@ def unpack_odometry(raw: bytes | memoryview, ros2: bool) -> Odometry:
         ValueError, struct.error: the bytes are of another layout.
     """
     view = memoryview(raw)
-    stamp, _, at = fields.header(view, ros2)
-    child, at = fields.string(view, fields.aligned(at, 4, ros2))
-    v = np.frombuffer(view, "<f8", 85, fields.aligned(at, 8, ros2))
+    stamp, _, at = layout.header(view, ros2)
+    child, at = layout.string(view, layout.aligned(at, 4, ros2))
+    v = np.frombuffer(view, "<f8", 85, layout.aligned(at, 8, ros2))
     pose, twist = v[:7].copy(), v[43:49].copy()
     if not pose.any():  # ROS 1's default: not filled in
         pose[6] = 1.0
@@ -58,14 +58,14 @@ def decode_fix(m: Any) -> Fix:
     if int(m.position_covariance_type) == 0:
         cov = np.diag([25.0, 25.0, 100.0])
         across, up = getattr(m, "err_horz", 0.0), getattr(m, "err_vert", 0.0)  # of a GPSFix, at 95 %
-        if across > 0 and up > 0:
-            cov = np.diag([across, across, up]) ** 2 / 4.0
+        if across > 0:  # False for NaN
+            cov = np.diag([across, across, up if up > 0 else 2.0 * across]) ** 2 / 4.0
     position = np.array([m.latitude, m.longitude, m.altitude], float)
     return Fix(stamp_of(m.header), m.header.frame_id.lstrip("/"), position, cov, _GPS_STATUS.get(status, status))
 
 
-_GPS_STATUS = {18: 1, 19: 2, 20: 1, 33: 1}
-"""What GPSStatus has beyond NavSatStatus (differential, RTK fixed, RTK float, WAAS) -> the nearest of that."""
+_GPS_STATUS = {18: 2, 19: 2, 20: 0, 33: 1}
+"""What GPSStatus has beyond NavSatStatus (differential, RTK fixed, RTK float, WAAS) -> what other receivers say in NavSatStatus."""
 
 
 def decode_twist(m: Any) -> Odometry:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from topograph.bags import raw as fields
+from topograph.bags import raw as layout
 from topograph.bags.scan import Scan
 from topograph.errors import InputError
 
@@ -23,8 +23,8 @@ LIVOX = (
     "livox_interfaces/msg/CustomMsg",
 )
 
-FARTHEST_M = 200.0
-"""Of a Velodyne's return: the range of the farthest of its models that are told by their packets."""
+FARTHEST_M = 300.0
+"""Of a Velodyne's return: none of its models sees further."""
 LONGEST_S = 2.0
 """From a message's stamp to a point of it: beyond, the clocks have nothing to do with each other."""
 _PACKET = np.dtype([("sec", "<u4"), ("nanosec", "<u4"), ("data", "u1", 1206)])
@@ -62,7 +62,7 @@ class Velodyne:
             InputError: no packets, or of a model that they do not tell (HDL-64E, VLP-32A and B).
             ValueError, struct.error: the bytes are of another layout.
         """
-        stamp, frame, at = fields.header(memoryview(raw), ros2)
+        stamp, frame, at = layout.header(memoryview(raw), ros2)
         packets = _rows(memoryview(raw), at, _PACKET, ros2)
         if not len(packets):
             raise InputError("a VelodyneScan without packets")
@@ -73,7 +73,10 @@ class Velodyne:
         try:
             _, points = self._decoder.decode(vector, True)
         except RuntimeError as err:
-            raise InputError(f"{err} Make clouds of the packets with velodyne_pointcloud's transform node") from err
+            raise InputError(
+                f"{str(err).rstrip('.')}. HDL-64E, VLP-32A and VLP-32B do not tell their model: make clouds of the packets with "
+                "velodyne_pointcloud's transform node"
+            ) from err
         xyz = np.stack([points[a] for a in "xyz"], axis=1)
         after = (
             int(stamps[-1]) - stamp
@@ -83,21 +86,22 @@ class Velodyne:
             frame=frame,
             xyz=xyz,
             ring=points["ring"].astype(np.int32),
-            offset=points["time"] + np.float32(after) if abs(after) < LONGEST_S else None,
+            offset=_within(points["time"] + np.float32(after if abs(after) < LONGEST_S else 0.0)),
             intensity=points["intensity"].copy(),
         )
 
 
-def unpack_livox(raw: bytes | memoryview, ros2: bool) -> Scan:
-    """Scan of a Livox driver's CustomMsg. What the sensor itself calls noise with high confidence, and beams without a return, are left out.
+def unpack_livox(raw: bytes | memoryview, ros2: bool) -> tuple[Scan, int]:
+    """Scan of a Livox driver's CustomMsg, and which of the driver's LiDARs took it. What the sensor itself calls noise with high
+    confidence, and beams without a return, are left out.
 
     Raises:
         ValueError, struct.error: the bytes are of another layout.
     """
     view = memoryview(raw)
-    stamp, frame, at = fields.header(view, ros2)
-    at = fields.aligned(at, 8, ros2)
-    (base,) = struct.unpack_from("<Q", view, at)
+    stamp, frame, at = layout.header(view, ros2)
+    at = layout.aligned(at, 8, ros2)
+    base, _, lidar = struct.unpack_from("<QIB", view, at)
     points = _rows(view, at + 16, _POINT, ros2)  # behind point_num (4), lidar_id (1) and a reserve (3)
     noise = ((points["tag"] & 3) == _NOISE) | ((points["tag"] >> 2 & 3) == _NOISE)
     hit = (points["x"] != 0) | (points["y"] != 0) | (points["z"] != 0)
@@ -105,14 +109,20 @@ def unpack_livox(raw: bytes | memoryview, ros2: bool) -> Scan:
     shift = (int(base) - stamp) * 1e-9
     if abs(shift) > LONGEST_S:  # the sensor's own clock, since it was switched on
         shift = 0.0
-    return Scan(
+    scan = Scan(
         stamp_ns=stamp,
         frame=frame,
         xyz=np.stack([points[a] for a in "xyz"], axis=1),
-        ring=points["line"].astype(np.int32),
-        offset=(points["offset_ns"] * 1e-9 + shift).astype(np.float32) if len(points) > 1 else None,
+        ring=None,  # a line of it wanders over the whole view
+        offset=_within((points["offset_ns"] * 1e-9 + shift).astype(np.float32)),
         intensity=points["reflectivity"].astype(np.float32),
     )
+    return scan, lidar
+
+
+def _within(offset: NDArray[np.float32]) -> NDArray[np.float32] | None:
+    """Times of points, s after the stamp, unless one of them is none."""
+    return offset if len(offset) > 1 and np.abs(offset).max() < LONGEST_S else None
 
 
 def _rows(view: memoryview, at: int, dtype: np.dtype[Any], ros2: bool) -> NDArray[Any]:
@@ -121,7 +131,7 @@ def _rows(view: memoryview, at: int, dtype: np.dtype[Any], ros2: bool) -> NDArra
     Raises:
         ValueError, struct.error: fewer bytes than announced.
     """
-    at = fields.aligned(at, 4, ros2)
+    at = layout.aligned(at, 4, ros2)
     (n,) = struct.unpack_from("<I", view, at)
     stride = (dtype.itemsize + 3) // 4 * 4 if ros2 else dtype.itemsize
     if n and at + 4 + (n - 1) * stride + dtype.itemsize > len(view):

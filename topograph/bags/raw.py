@@ -16,10 +16,10 @@ def header(raw: memoryview, ros2: bool) -> tuple[int, str, int]:
     """Stamp (ns), frame, and the offset behind a std_msgs/Header at the start of `raw`.
 
     Raises:
-        ValueError, struct.error: big-endian CDR, or too few bytes.
+        ValueError, struct.error: another encapsulation than plain little-endian CDR, or too few bytes.
     """
     if ros2 and raw[1] != 1:
-        raise ValueError("big-endian CDR")
+        raise ValueError("big-endian CDR, or another encapsulation than plain CDR")
     sec, nanosec = struct.unpack_from("<iI" if ros2 else "<II", raw, 4)
     frame, at = string(raw, 12)
     return sec * 1_000_000_000 + nanosec, frame.lstrip("/"), at

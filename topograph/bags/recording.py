@@ -85,6 +85,7 @@ class Recording:
         self._readers: list[Reader] = []
         self._stack = ExitStack()
         self._velodyne: packets.Velodyne | None = None
+        self._livox: int | None = None
 
     @property
     def moved_by_lidar(self) -> bool:
@@ -142,7 +143,7 @@ class Recording:
         """The file by its index; raises whatever the readers' libraries do on damage."""
         if path.suffix == ".active":
             raise ValueError("it was never closed")
-        if path.suffix == ".zstd":
+        if path.suffix in PACKED:
             path = self._inflated(path)
         beside = [q for q in side_files(path) if q.stat().st_size]
         if beside:
@@ -169,6 +170,10 @@ class Recording:
         with path.open("rb") as packed, inflated.open("wb") as out:
             try:
                 zstandard.ZstdDecompressor().copy_stream(packed, out)
+            except OSError as err:
+                raise InputError(
+                    f"{path}: cannot be decompressed into {inflated.parent.parent} ({err.strerror}); make room there, or name a folder in TMPDIR"
+                ) from err
             except zstandard.ZstdError as err:
                 if self.config.strict:
                     raise
@@ -196,7 +201,7 @@ class Recording:
             return self._salvage(path, err)
 
     def _salvaged(self, path: Path) -> Salvaged:
-        if path.suffix != ".zstd":
+        if path.suffix not in PACKED:
             return Salvaged(path)
         inflated = self._inflated(path)
         if not inflated.stat().st_size:
@@ -389,6 +394,8 @@ class Recording:
                 return odometry
             if kind == "points":
                 scan = self._scan(reader, typ, raw)
+                if scan is None:
+                    return None
                 finite = np.isfinite(scan.xyz)
                 if not (finite[:, 0] & finite[:, 1] & finite[:, 2]).any():
                     self._count(f"points: {EMPTY}")
@@ -414,12 +421,27 @@ class Recording:
             log.debug("%s: %s", connection.topic, err)
             return None
 
-    def _scan(self, reader: Reader, typ: str, raw: Any) -> Scan:
+    def _count_second(self, lidar: int) -> None:
+        """Count a sweep of a LiDAR whose mounting is not that of the topic's frame."""
+        self._count("points: of a second LiDAR on one topic")
+        note = (
+            f"several LiDARs on one topic, under one frame: those with lidar_id {self._livox} are read, those with {lidar} are not "
+            "(the driver's multi_topic records them apart)"
+        )
+        if note not in self.notes:
+            self.notes.append(note)
+
+    def _scan(self, reader: Reader, typ: str, raw: Any) -> Scan | None:
         if typ == packets.VELODYNE:
             self._velodyne = self._velodyne or packets.Velodyne()
             return self._velodyne(raw, reader.is2)
         if typ in packets.LIVOX:
-            return packets.unpack_livox(raw, reader.is2)
+            scan, lidar = packets.unpack_livox(raw, reader.is2)
+            self._livox = lidar if self._livox is None else self._livox
+            if lidar != self._livox:
+                self._count_second(lidar)
+                return None
+            return scan
         message: Any = reader.deserialize(raw, typ)
         return decode_scan(message, decode.stamp_of(message.header))
 
@@ -476,16 +498,15 @@ def _resolve(path: Path) -> list[Path]:
 
 
 _RECORDING = {".bag", ".mcap", ".db3"}
+PACKED = {".zstd", ".zst"}
+"""Of a file that ROS 2, or somebody by hand, has compressed as a whole."""
 
 
 def recordings_in(folder: Path) -> list[Path]:
     """The recordings' files in a folder; those of one run are its parts."""
-    return sorted(p for p in folder.iterdir() if p.is_file() and (p.suffix in {*_RECORDING, ".active"} or _packed(p)))
-
-
-def _packed(path: Path) -> bool:
-    """Compressed as a whole by ROS 2."""
-    return path.suffix == ".zstd" and Path(path.stem).suffix in {".mcap", ".db3"}
+    plain = [p for p in folder.iterdir() if p.is_file() and p.suffix in {*_RECORDING, ".active"}]
+    packed = [p for p in folder.iterdir() if p.is_file() and p.suffix in PACKED and Path(p.stem).suffix in _RECORDING]
+    return sorted([*plain, *(p for p in packed if p.with_suffix("") not in plain)])  # `ros2 bag play` leaves both
 
 
 def side_files(path: Path) -> list[Path]:

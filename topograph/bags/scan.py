@@ -50,6 +50,8 @@ def decode(message: Any, stamp_ns: int) -> Scan:
     for k, a in enumerate("xyz"):
         xyz[:, k] = view[names[a]]
     ring_name = next((names[n] for n in _RING_NAMES if n in names), None)
+    if ring_name is not None and ring_name.lower() == "line" and "tag" in names:
+        ring_name = None  # a Livox driver's: its lines wander over the whole view
     ring = None if ring_name is None else view[ring_name].astype(np.int32)
     intensity_name = next((names[n] for n in ("intensity", "i", "reflectivity") if n in names), None)
     intensity = None if intensity_name is None else np.asarray(view[intensity_name], np.float32)  # no copy: seldom used

@@ -22,6 +22,8 @@ GAP = {"points": 1.0, "trunks": 2.0, "odometry": 0.5, "imu": 0.2, "fix": 10.0, "
 """Silences that are worth a word, s: trunks of the map, wheels and gyro are bridged for less."""
 SILENT_STEPS = 5.0
 """Of a stream's own steps, and it is silent: sweeps may be taken at stops only."""
+FASTEST_HZ = 40.0
+"""Of a LiDAR's sweeps: beyond, a message holds a part of one."""
 LATE = 0.5
 """Stamps whose distance from the time of recording differs by more between streams, s."""
 LOW = {"odometry": 5.0, "imu": 20.0}
@@ -175,6 +177,10 @@ def _points(points: Role, trunks: Role, recording: Recording, found: Survey) -> 
         ]
     points.facts.append(f"{np.median([len(c.xyz) for c in clouds]):.0f} points of {' '.join(found.fields)}")
     points.facts.append(_times(clouds))
+    if points.stream.rate_hz > FASTEST_HZ:
+        points.problems.append(
+            f"{points.stream.rate_hz:.0f} clouds a second are parts of sweeps: join those of a turn into one"
+        )
     if clouds[0].offset is None:
         points.problems.append("no time per point: sweeps cannot be deskewed")
     blockers = _no_mount(points.stream, recording)

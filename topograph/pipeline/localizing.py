@@ -73,7 +73,9 @@ def localize_bags(
         out.chosen, out.duration_s, out.skipped = dict(recording.chosen), recording.duration_s, recording.skipped
         if "odometry" not in recording.chosen and not recording.moved_by_lidar:
             raise InsufficientDataError(
-                "localization needs wheel odometry: name it with --topic-odometry, or take the motion from the point clouds with --topic-odometry lidar"
+                "localization needs wheel odometry: name it with --topic-odometry"
+                + "".join(f" ({t}, if that is the robot's own velocity)" for t in recording.to_name("odometry"))
+                + ", or take the motion from the point clouds with --topic-odometry lidar"
             )
         if not {"points", "trunks"} & set(recording.chosen):
             raise InsufficientDataError(

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from topograph.bags import Fix, Heading, Imu, Odometry
-from topograph.geometry import Array, Datum, interpolate, planar, to_quaternion, transform, wrap, yaw_of
+from topograph.geometry import Array, Datum, interpolate, inverse, planar, to_quaternion, transform, wrap, yaw_of
 from topograph.motion import (
     MotionConfig,
     align_imu,
@@ -435,3 +435,50 @@ def test_trunks_watch_wheels_and_gyro(seed: int) -> None:
     assert drive(-1.0, 1.0)[0] > 0.9
     assert drive(1.0, 0.0)[1] > 0.8
     assert drive(1.0, 1.3)[1] > 0.5
+
+
+@given(st.integers(0, 50), st.floats(0.5, 1.0), st.floats(-3.1, 3.1), st.floats(-0.4, 0.4), st.integers(500, 900))
+@settings(max_examples=8, deadline=None, phases=[Phase.explicit, Phase.generate])
+def test_a_step_in_which_wheels_and_fixes_part_tells_nothing(
+    seed: int, size: float, way: float, turn: float, at: int
+) -> None:
+    """Odometry that jumps (a scan that was matched wrongly) looks like fixes that jump: that step is wide, the others are as they were."""
+    streams, true = drive(seed)
+    streams = fixes_of(streams, true, 5.0, 0.015, LEVER, seed)
+    sound = dead_reckon(streams, None, np.eye(4), MotionConfig(), LEVER)
+    assert sound is not None
+    assert not len(sound.breaks)
+    T = streams.odom_T_child.copy()
+    broken = inverse(T[at]) @ T[at + 1] @ planar(size * np.cos(way), size * np.sin(way), turn)
+    T[at + 1 :] = T[at] @ broken @ (inverse(T[at + 1]) @ T[at + 1 :])
+    motion = dead_reckon(replace(streams, odom_T_child=T), None, np.eye(4), MotionConfig(), LEVER)
+    assert motion is not None
+    seconds = (streams.odometry_ns - streams.odometry_ns[0]) * 1e-9
+    assert len(motion.breaks) + len(motion.slips) >= 1
+    if not len(motion.breaks):  # forward, it may be taken for a slip
+        return
+    assert motion.breaks[0, 0] == pytest.approx(seconds[at], abs=0.5)
+    assert motion.breaks[0, 1] == pytest.approx(size, abs=0.15 + 0.1 * size)
+    stamps = streams.odometry_ns[::5]
+    before, after = (m.sigma(MotionConfig(), stamps) for m in (sound, motion))
+    away = np.abs(seconds[::5][:-1] - seconds[at]) > 0.6
+    np.testing.assert_allclose(after[away, 3:5], before[away, 3:5], rtol=0.3, atol=0.01)
+    near = ~away
+    if not len(motion.slips):
+        assert np.sum(after[near, 4] - before[near, 4]) > 0.5 * size
+
+
+@pytest.mark.parametrize("back_s", [1.0, 30.0])
+def test_fixes_that_jump_are_left_to_the_trees_too(back_s: float) -> None:
+    """From outside nobody can tell: fixes that step aside for good part from the wheels in one step. A jump that comes back within the
+    windows is none of it."""
+    streams, true = drive(7)
+    streams = fixes_of(streams, true, 5.0, 0.015, LEVER)
+    enu = streams.fixes_enu()
+    seconds = (streams.fix_ns - streams.fix_ns[0]) * 1e-9
+    enu[(seconds > 12.0) & (seconds < 12.0 + back_s), 0] += 0.8
+    streams = replace(streams, lat_lon_h=Datum(*np.median(streams.lat_lon_h, axis=0)).to_geodetic(enu))
+    motion = dead_reckon(streams, None, np.eye(4), MotionConfig(), LEVER)
+    assert motion is not None
+    assert len(motion.breaks) == (2 if back_s > 20.0 else 0)  # aside, and back
+    np.testing.assert_allclose(motion.odom_T_robot, streams.odom_T_child, atol=1e-6)

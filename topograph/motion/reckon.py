@@ -61,6 +61,8 @@ class Motion:
         gyro: the turn is the gyro's.
         wheels: the distance is the wheels'.
         doubt: (M,) m, what slips add to the deviation of the steps, summed up; () where there were none.
+        broken: (M, 2) m and rad, what steps in which wheels and fixes part add to the deviation, summed up; (0, 2) where there were none.
+        breaks: (B, 3) time of each (s since the first stamp), and by how much they part, m and rad.
         wheel_scale: what the wheels were multiplied with, since fixes told so.
         slips: (S, 3) from, to (s since the first stamp) and the robot's speed less the wheels', m/s.
         slips_by_trunks: trunks told of them, not fixes.
@@ -74,6 +76,8 @@ class Motion:
     gyro: bool
     wheels: bool
     doubt: Array = field(default_factory=lambda: np.zeros(0))
+    broken: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    breaks: Array = field(default_factory=lambda: np.zeros((0, 3)))
     wheel_scale: float = 1.0
     slips: Array = field(default_factory=lambda: np.zeros((0, 3)))
     unseen: Array = field(default_factory=lambda: np.zeros(0))
@@ -109,6 +113,9 @@ class Motion:
             along = across = up = 0.5 * dt + 0.05
         if len(self.doubt):
             along = np.hypot(along, np.diff(np.interp(stamps_ns, self.stamps_ns, self.doubt)))
+        if len(self.broken):
+            apart, turned = (np.diff(np.interp(stamps_ns, self.stamps_ns, b)) for b in self.broken.T)
+            along, across, yaw = np.hypot(along, apart), np.hypot(across, apart), np.hypot(yaw, turned)
         return np.stack([tilt, tilt, yaw, along, across, up], axis=1)
 
 
@@ -133,6 +140,9 @@ def dead_reckon(
     gyro = inertial if overlap else None
     motion = _joined(streams, step, gyro, config)
     check = against_fixes(streams, motion.odom_T_robot, np.zeros(3) if robot_p_antenna is None else robot_p_antenna)
+    if len(check.breaks):
+        summed = np.concatenate([np.zeros((1, 2)), np.cumsum(check.broken, axis=0)])
+        motion = replace(motion, broken=summed, breaks=check.breaks)
     if check.scale == 1.0 and not len(check.slips):
         return motion
     step[:, :3, 3] *= check.factor[:, None]
@@ -140,7 +150,7 @@ def dead_reckon(
     doubt = np.concatenate([[0.0], np.cumsum(check.doubt)])
     return replace(
         _joined(streams, step, gyro, config), doubt=doubt if check.doubt.any() else np.zeros(0), wheel_scale=check.scale,
-        slips=check.slips,
+        slips=check.slips, broken=motion.broken, breaks=motion.breaks,
     )  # fmt: skip
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, binary_opening
+from scipy.ndimage import binary_dilation, binary_opening, maximum_filter1d
 
-from topograph.geometry import Array, Stamps, interpolate, transform
+from topograph.geometry import Array, Stamps, interpolate, transform, wrap
 from topograph.session import Streams
 
 GOOD_FIX = 0.15
@@ -32,6 +32,10 @@ SCALE = 0.03
 CLEAR = 0.15
 """Windows that scatter by more are of fixes that jump, and tell nothing of the wheels."""
 LEAST_WINDOWS = 15
+EVEN_S = 4.0
+"""Before and after a break, in which wheels and fixes go together."""
+BREAK, EVEN, LEAST_WAY = 0.3, 6.0, 0.5
+"""They part by so many m, and so many times what they part by before and after, where those ways reach so far about their middle, m RMS."""
 SLIP_SIGMA = 0.3
 """Share of the difference that is not known after the fixes' speed has been put in its place."""
 
@@ -46,6 +50,8 @@ class WheelCheck:
         doubt: (M,) m, standard deviation of the step for the slip alone.
         scale: of the wheels, 1 where it was not corrected.
         slips: (S, 3) from, to (s since the first odometry) and mean difference of speed, m/s.
+        breaks: (B, 3) time (s since the first odometry) at which wheels and fixes part in one step, by how much, m and rad.
+        broken: (M, 2) m and rad, standard deviations of each step for such a break.
     """
 
     factor: Array
@@ -53,6 +59,8 @@ class WheelCheck:
     doubt: Array
     scale: float
     slips: Array
+    breaks: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    broken: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 def against_fixes(streams: Streams, odom_T_robot: Array, robot_p_antenna: Array) -> WheelCheck:
@@ -111,7 +119,58 @@ def against_fixes(streams: Streams, odom_T_robot: Array, robot_p_antenna: Array)
     advance = np.where(inside & stands, forward, 0.0)
     off = np.interp(centre, where, (way - told) / seconds)
     doubt = np.where(inside, (SLIP_SIGMA * np.abs(off) + 0.05) * np.diff(ns) * 1e-9, 0.0)
-    return WheelCheck(factor, advance, doubt, scale, _spans(centre, inside, off, ns[0]))
+    broken, told = np.zeros((steps, 2)), []
+    for last, metres, radians in breaks(at, enu, antenna, sigma):
+        mine = (ns[1:] > at[last]) & (ns[:-1] < at[last + 1]) & ~inside
+        if mine.any():
+            broken[mine] = np.array([metres, radians]) / mine.sum()
+            told.append((float(at[last] - ns[0]) * 1e-9, metres, radians))
+    return WheelCheck(
+        factor, advance, doubt, scale, _spans(centre, inside, off, ns[0]), np.array(told, float).reshape(-1, 3), broken
+    )
+
+
+def breaks(at: Stamps, enu: Array, antenna: Array, sigma: Array) -> list[tuple[int, float, float]]:
+    """(k, m, rad): between the fixes k and k + 1 the way of the wheels (N, 2) and the fixes (N, 2) part in one step, though before and
+    after it they are one and the same. Either may be the one that jumped: the step tells nothing, the trees have to.
+    """
+    n = max(5, round(EVEN_S / max(float(np.median(np.diff(at))) * 1e-9, 1e-3)))
+    if len(at) < 2 * n:
+        return []
+    turn, middle, target, rms, reach = _fits(antenna, enu, n)
+    before, after = np.arange(len(at) - 2 * n + 1), np.arange(n, len(at) - n + 1)
+    k = before + n - 1
+    mid = 0.5 * (antenna[k] + antenna[k + 1])
+    apart = np.linalg.norm(_put(turn, middle, target, before, mid) - _put(turn, middle, target, after, mid), axis=1)
+    uneven = np.maximum(np.maximum(rms[before], rms[after]), sigma[k])
+    found = (apart > BREAK) & (apart > EVEN * uneven) & (np.minimum(reach[before], reach[after]) > LEAST_WAY)
+    found &= (np.diff(at)[k] < LONGEST_S * 1e9) & (apart >= maximum_filter1d(apart, 2 * n + 1))
+    turned = np.abs(wrap(turn[after] - turn[before]))
+    return [(int(k[i]), float(apart[i]), float(turned[i])) for i in np.flatnonzero(found)]
+
+
+def _fits(source: Array, target: Array, n: int) -> tuple[Array, Array, Array, Array, Array]:
+    """Of each window of `n` points: the turn (W,), rad, and the middles (W, 2) that lay `source` (N, 2) onto `target` (N, 2), what is left,
+    m RMS (W,), and how far the source reaches about its middle, m RMS (W,)."""
+    shift_s, shift_t = source[0], target[0]
+    s, t = source - shift_s, target - shift_t
+    columns = np.column_stack([s, t, np.sum(s * t, axis=1), s[:, 0] * t[:, 1] - s[:, 1] * t[:, 0], np.sum(s * s, axis=1), np.sum(t * t, axis=1)])  # fmt: skip
+    total = np.cumsum(np.concatenate([np.zeros((1, columns.shape[1])), columns]), axis=0)
+    m = (total[n:] - total[:-n]) / n
+    a, b = m[:, :2], m[:, 2:4]
+    dot = m[:, 4] - np.sum(a * b, axis=1)
+    cross = m[:, 5] - (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    spread_s, spread_t = m[:, 6] - np.sum(a * a, axis=1), m[:, 7] - np.sum(b * b, axis=1)
+    left = spread_s + spread_t - 2.0 * np.hypot(dot, cross)
+    root = [np.sqrt(np.maximum(v, 0.0)) for v in (left, spread_s)]
+    return np.arctan2(cross, dot), a + shift_s, b + shift_t, root[0], root[1]
+
+
+def _put(turn: Array, middle: Array, target: Array, window: NDArray[np.int64], points: Array) -> Array:
+    """Where the fits of `window` (K,) put `points` (K, 2)."""
+    c, s = np.cos(turn[window]), np.sin(turn[window])
+    x, y = (points - middle[window]).T
+    return np.stack([c * x - s * y, s * x + c * y], axis=1) + target[window]
 
 
 def _factor(base: Array, turn: Array, reach: Array) -> Array:

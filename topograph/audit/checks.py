@@ -392,12 +392,8 @@ def lean(problem: Problem, estimate: Estimate) -> tuple[Array, Array]:
     prior = np.diag([0.0, 0.0, 1.0, 1.0]) / COMMON_LEAN**2 * ALIKE_LEAN**2
     H = A.T @ A + prior
     x = np.linalg.solve(H, A.T @ b)
-    # Keyframes see the same trees again and again: what they say together is no surer than as many as show other trees.
-    s = problem.sightings
-    pairs = np.unique(np.stack([s.keyframe, s.tree]), axis=1)
-    in_view = pairs.shape[1] / max(len(np.unique(s.keyframe)), 1)
-    anew = float(np.clip(problem.n_trees / max(in_view, 1.0), 1.0, SEEN_ANEW))
-    sigma = ALIKE_LEAN * np.sqrt(np.diag(np.linalg.inv(H)) * max(1.0, n / anew))
+    # Keyframes see the same trees again and again: what they say together is no surer than a few of them.
+    sigma = ALIKE_LEAN * np.sqrt(np.diag(np.linalg.inv(H)) * max(1.0, n / SEEN_ANEW))
     return x[:2], sigma[:2]
 
 
@@ -406,7 +402,7 @@ COMMON_LEAN = 0.05
 ALIKE_LEAN = 0.06
 """Standard deviation of a keyframe's mean axis, rad."""
 SEEN_ANEW = 12.0
-"""Keyframes' worth of independent trees in a run, at most: all of them, by those that are in view at once."""
+"""Keyframes' worth of independent trees in a run."""
 
 
 TOO_NEAR, TWIN, TWOFOLD = 0.25, 0.3, 0.5

@@ -119,14 +119,14 @@ def against_fixes(streams: Streams, odom_T_robot: Array, robot_p_antenna: Array)
     advance = np.where(inside & stands, forward, 0.0)
     off = np.interp(centre, where, (way - told) / seconds)
     doubt = np.where(inside, (SLIP_SIGMA * np.abs(off) + 0.05) * np.diff(ns) * 1e-9, 0.0)
-    broken, told = np.zeros((steps, 2)), []
+    broken, parts = np.zeros((steps, 2)), []
     for last, metres, radians in breaks(at, enu, antenna, sigma):
         mine = (ns[1:] > at[last]) & (ns[:-1] < at[last + 1]) & ~inside
         if mine.any():
             broken[mine] = np.array([metres, radians]) / mine.sum()
-            told.append((float(at[last] - ns[0]) * 1e-9, metres, radians))
+            parts.append((float(at[last] - ns[0]) * 1e-9, metres, radians))
     return WheelCheck(
-        factor, advance, doubt, scale, _spans(centre, inside, off, ns[0]), np.array(told, float).reshape(-1, 3), broken
+        factor, advance, doubt, scale, _spans(centre, inside, off, ns[0]), np.array(parts, float).reshape(-1, 3), broken
     )
 
 

@@ -46,9 +46,9 @@ def trunks(
     if not (np.isfinite(distance).all() and (distance >= 0.01).all()):
         raise ValueError("a trunk must be finite and not inside the sensor")
     unit = robot_p_trunk / distance[:, None]
-    towards = unit if expected is None else expected / np.maximum(np.linalg.norm(expected, axis=1, keepdims=True), 1e-9)
-    near = np.sum(towards * unit, axis=1) > NEAR
-    basis = bearing_basis(np.where(near[:, None], robot_p_trunk if expected is None else expected, robot_p_trunk))
+    begun = robot_p_trunk if expected is None else expected
+    near = np.sum(begun * unit, axis=1) > NEAR * np.maximum(np.linalg.norm(begun, axis=1), 1e-9)
+    basis = bearing_basis(np.where(near[:, None], begun, robot_p_trunk))
     J = np.concatenate([np.swapaxes(basis, 1, 2) / distance[:, None, None], unit[:, None, :]], axis=1)
     turned = J @ cov @ np.swapaxes(J, 1, 2)
     turned = 0.5 * (turned + np.swapaxes(turned, 1, 2))

@@ -10,7 +10,7 @@ import pytest
 import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from packets import convert, livox_message, packets_of, store_of, velodyne_message
+from packets import FIRING_S, LASER_S, convert, livox_message, packets_of, store_of, velodyne_message
 from rosbags import rosbag1, rosbag2
 
 from topograph.bags import BagsConfig, Fix, Odometry, Recording, Scan, Trunks
@@ -25,7 +25,6 @@ from topograph.simulate import DriveConfig, OrchardConfig, SensorConfig, record
 from topograph.topomap import TopoMap
 
 T0 = 1_700_000_000_123_456_000
-FIRING_S, LASER_S = 55.296e-6, 2.304e-6
 
 
 def header(store: Any, ros1: bool, stamp_ns: int, frame: str = "velodyne") -> Any:

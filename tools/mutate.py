@@ -116,7 +116,7 @@ BREAKS = [
     Break("digests not checked", T + "store/digest.py", "if table in DIGESTED and digest(c, table) != value:", "if False:", P + "test_store.py"),
     Break("commits at 100 times the risk", T + "localize/config.py", "risk: Chance = 1e-4", "risk: Chance = 0.3", P + "test_localize.py -k 'lattice or another or commits'"),
     Break("alarms never fire", T + "localize/engine.py", "if self.sums[0] > self.config.lost or self.sums[1] > self.config.slip:", "if False:", f"{P}test_localize.py -k kidnapped"),
-    Break("a bearing's noise in the basis of what was measured", "factors/trunk.py", "towards = unit if expected is None else", "towards = unit if True else", P + "test_factors.py -k abeam"),
+    Break("a bearing's noise in the basis of what was measured", "factors/trunk.py", "begun = robot_p_trunk if expected is None else", "begun = robot_p_trunk if True else", P + "test_factors.py -k abeam"),
     Break("heights of recorded trunks as each scan has them", T + "localize/localizer.py", "if len(trunks.kinds):  # our own", "if True:  # our own", P + "test_localize.py -k leaning"),
     Break("a renamed tree is another decision", T + "mapping/association.py", "same = np.intersect1d(mine_first, theirs_first)", "same = np.flatnonzero(mine == theirs)", P + "test_tracks.py -k whatever"),
     Break("a tilt grows with the scans", T + "motion/online.py", "max(a.sigma**2 - LEVEL_SIGMA**2, 0.0)", "max(a.sigma**2, 0.0)", P + "test_localize.py -k asked"),

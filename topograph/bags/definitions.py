@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import cache
+
+from rosbags.interfaces.typing import Typesdict
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -44,7 +47,10 @@ _DEFINITIONS = {
 def typestore(*, ros1: bool) -> Typestore:
     """ROS's own messages (Noetic's, Humble's) and those above."""
     store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
-    for name, text in _DEFINITIONS.items():
-        types = get_types_from_msg(text, name)
-        store.register({k: v for k, v in types.items() if k not in store.types})
+    store.register({name: fields for name, fields in _parsed().items() if name not in store.types})
     return store
+
+
+@cache
+def _parsed() -> Typesdict:
+    return {k: v for name, text in _DEFINITIONS.items() for k, v in get_types_from_msg(text, name).items()}

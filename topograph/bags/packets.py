@@ -23,6 +23,12 @@ LIVOX = (
     "livox_interfaces/msg/CustomMsg",
 )
 
+FIELDS = {
+    VELODYNE: ("x", "y", "z", "intensity", "ring", "time"),
+    **dict.fromkeys(LIVOX, ("x", "y", "z", "reflectivity", "tag", "line", "offset_time")),
+}
+"""What a point of theirs has."""
+
 FARTHEST_M = 300.0
 """Of a Velodyne's return: none of its models sees further."""
 LONGEST_S = 2.0

@@ -25,6 +25,7 @@ from topograph.bags import decode, packets, topics
 from topograph.bags.clocks import Clocks, Message
 from topograph.bags.config import BagsConfig
 from topograph.bags.definitions import typestore
+from topograph.bags.files import PACKED, recordings_in, refuse_twice, resolve, side_files
 from topograph.bags.frames import Frames
 from topograph.bags.messages import Fix, Heading, Imu, Odometry, Trunks
 from topograph.bags.salvage import Salvaged, SalvagedFolder, why_unreadable
@@ -65,8 +66,8 @@ class Recording:
     """
 
     def __init__(self, paths: Sequence[Path], config: BagsConfig | None = None) -> None:
-        self.paths = [q for p in paths for q in _resolve(Path(p))]
-        _refuse_twice(self.paths)
+        self.paths = [q for p in paths for q in resolve(Path(p))]
+        refuse_twice(self.paths)
         self.config = config or BagsConfig()
         self.skipped: Counter[str] = Counter()
         self.frames = Frames(self.config.base_frame, self.config.extrinsics)
@@ -177,9 +178,8 @@ class Recording:
             except zstandard.ZstdError as err:
                 if self.config.strict:
                     raise
-                log.info(
-                    "%s: damaged (%r)", path, err
-                )  # what is whole is read, what is missing is told by the file in it
+                # What is whole is read; what is missing is told by the file in it.
+                log.info("%s: damaged (%r)", path, err)
         return inflated
 
     def _joined(self, path: Path, beside: Sequence[Path]) -> Path:
@@ -342,9 +342,7 @@ class Recording:
                 for connection, log_ns, raw in reader.messages(connections=found, start=last, stop=stop):
                     if not isinstance(log_ns, int):  # a row of SQLite may hold anything
                         raise TypeError(f"time of recording {log_ns!r}")
-                    if (
-                        reader.is2 and bytes(raw[:4]) == ZSTD
-                    ):  # message by message, which only metadata.yaml would have told
+                    if reader.is2 and bytes(raw[:4]) == ZSTD:  # which only metadata.yaml would have told
                         raw = zstandard.ZstdDecompressor().decompress(raw)
                     if log_ns == last and given[connection.topic]:
                         given[connection.topic] -= 1
@@ -447,10 +445,8 @@ class Recording:
 
     def _fields(self, reader: Reader, connection: Connection, raw: Any) -> tuple[str, ...]:
         """Names of what a point has."""
-        if connection.msgtype == packets.VELODYNE:
-            return ("x", "y", "z", "intensity", "ring", "time")
-        if connection.msgtype in packets.LIVOX:
-            return ("x", "y", "z", "reflectivity", "tag", "line", "offset_time")
+        if connection.msgtype in packets.FIELDS:
+            return packets.FIELDS[connection.msgtype]
         message: Any = reader.deserialize(raw, connection.msgtype)
         return tuple(f.name for f in message.fields)
 
@@ -469,47 +465,3 @@ class Recording:
 def _sane(values: NDArray[np.float64]) -> bool:
     """Finite, and of a size that something on Earth may have in SI units."""
     return bool(np.isfinite(values).all() and np.abs(values).max() < 1e9)
-
-
-def _refuse_twice(paths: Sequence[Path]) -> None:
-    """Raise InputError where one recording is named twice: its messages would count double."""
-    inside = [q.resolve() for p in paths for q in ([p] if p.is_file() else recordings_in(p))]
-    for p in inside:
-        if inside.count(p) > 1:
-            raise InputError(f"{p}: is given twice, by itself or with its folder")
-
-
-def _resolve(path: Path) -> list[Path]:
-    """The files (or the ROS 2 folder) that a name stands for."""
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder")
-    if path.is_dir() and not (path / "metadata.yaml").exists():
-        inside = recordings_in(path)
-        if not inside:
-            raise InputError(f"{path}: a folder without a recording; give a .bag, a .mcap, a .db3 or a ROS 2 folder")
-        if any(".bag" in p.suffixes for p in inside) and len(inside) > 1:
-            raise InputError(
-                f"{path}: a folder of {len(inside)} bags; name those of one run: {[p.name for p in inside]}"
-            )
-        return inside
-    if not path.is_dir() and (not path.is_file() or not _RECORDING & set(path.suffixes)):
-        raise InputError(f"{path}: not a recording; give a .bag, a .mcap, a .db3 or a ROS 2 folder")
-    return [path]
-
-
-_RECORDING = {".bag", ".mcap", ".db3"}
-PACKED = {".zstd", ".zst"}
-"""Of a file that ROS 2, or somebody by hand, has compressed as a whole."""
-
-
-def recordings_in(folder: Path) -> list[Path]:
-    """The recordings' files in a folder; those of one run are its parts."""
-    plain = [p for p in folder.iterdir() if p.is_file() and p.suffix in {*_RECORDING, ".active"}]
-    packed = [p for p in folder.iterdir() if p.is_file() and p.suffix in PACKED and Path(p.stem).suffix in _RECORDING]
-    return sorted([*plain, *(p for p in packed if p.with_suffix("") not in plain)])  # `ros2 bag play` leaves both
-
-
-def side_files(path: Path) -> list[Path]:
-    """Journals that stand beside an SQLite recording that was not closed."""
-    names = (path.with_name(path.name + end) for end in ("-wal", "-journal"))
-    return [p for p in names if path.suffix == ".db3" and p.is_file()]

@@ -209,13 +209,13 @@ def _wheel_notes(motion: Motion) -> list[str]:
             f"wheels slipped or were blocked from {begin:.1f} to {end:.1f} s (off by {-speed:+.2f} m/s): "
             f"the {'trunks' if motion.slips_by_trunks else 'fixes'}' speed stands in"
         )
+    if len(motion.slips) > 5:
+        out.append(f"wheels slipped {len(motion.slips) - 5} more times")
     for at, apart, turned in motion.breaks[:5].tolist():
         out.append(
             f"at {at:.1f} s wheels and fixes part in one step, by {apart:.2f} m and {np.degrees(turned):.0f}°: "
             "it is left to the trees (a jump of the odometry, or of the fixes)"
         )
-    if len(motion.slips) > 5:
-        out.append(f"wheels slipped {len(motion.slips) - 5} more times")
     return out
 
 

@@ -119,15 +119,21 @@ def against_fixes(streams: Streams, odom_T_robot: Array, robot_p_antenna: Array)
     advance = np.where(inside & stands, forward, 0.0)
     off = np.interp(centre, where, (way - told) / seconds)
     doubt = np.where(inside, (SLIP_SIGMA * np.abs(off) + 0.05) * np.diff(ns) * 1e-9, 0.0)
-    broken, parts = np.zeros((steps, 2)), []
-    for last, metres, radians in breaks(at, enu, antenna, sigma):
-        mine = (ns[1:] > at[last]) & (ns[:-1] < at[last + 1]) & ~inside
+    told_breaks, broken = _broken(ns, at, ~inside, breaks(at, enu, antenna, sigma))
+    return WheelCheck(factor, advance, doubt, scale, _spans(centre, inside, off, ns[0]), told_breaks, broken)
+
+
+def _broken(
+    ns: Stamps, at: Stamps, free: NDArray[np.bool_], found: list[tuple[int, float, float]]
+) -> tuple[Array, Array]:
+    """`WheelCheck.breaks` and `.broken` of those found between fixes at `at`, in steps of the wheels (M,) that are `free` of slips."""
+    broken, parts = np.zeros((len(free), 2)), []
+    for last, metres, radians in found:
+        mine = (ns[1:] > at[last]) & (ns[:-1] < at[last + 1]) & free
         if mine.any():
             broken[mine] = np.array([metres, radians]) / mine.sum()
             parts.append((float(at[last] - ns[0]) * 1e-9, metres, radians))
-    return WheelCheck(
-        factor, advance, doubt, scale, _spans(centre, inside, off, ns[0]), np.array(parts, float).reshape(-1, 3), broken
-    )
+    return np.array(parts, float).reshape(-1, 3), broken
 
 
 def breaks(at: Stamps, enu: Array, antenna: Array, sigma: Array) -> list[tuple[int, float, float]]:

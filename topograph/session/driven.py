@@ -27,13 +27,17 @@ def driven(stamps_ns: NDArray[np.int64], odom_T_child: Array, twist: Array) -> A
 
 def _needed(stamps_ns: NDArray[np.int64], odom_T_child: Array, twist: Array) -> bool:
     """The twists tell of motion before the position, or the orientation, has changed for the first time."""
-    steps = _steps(0.5 * (twist[:-1] + twist[1:]), np.diff(stamps_ns) * 1e-9)
-    for part, size in ((np.s_[:, :3, :3], _angle(steps)), (np.s_[:, :3, 3], np.linalg.norm(steps[:, :3, 3], axis=1))):
-        changed = np.abs(odom_T_child[part] - odom_T_child[part][0]).reshape(len(odom_T_child), -1).max(axis=1) >= SAME
-        first = int(changed.argmax()) if changed.any() else len(changed)
-        if size[: max(first - 1, 0)].sum() > TOLD:
-            return True
-    return False
+    apart = np.abs(odom_T_child[:, :3] - odom_T_child[0, :3])
+    turns, travels = (_first(v >= SAME) for v in (apart[:, :, :3].max(axis=(1, 2)), apart[:, :, 3].max(axis=1)))
+    n = max(turns, travels)
+    steps = _steps(0.5 * (twist[: n - 1] + twist[1:n]), np.diff(stamps_ns[:n]) * 1e-9)
+    turned, moved = _angle(steps[: turns - 1]), np.linalg.norm(steps[: travels - 1, :3, 3], axis=1)
+    return bool(turned.sum() > TOLD or moved.sum() > TOLD)
+
+
+def _first(true: NDArray[np.bool_]) -> int:
+    """Index of the first one, and their number where there is none."""
+    return int(true.argmax()) if true.any() else len(true)
 
 
 class Driven:

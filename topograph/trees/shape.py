@@ -111,7 +111,8 @@ def shapes(
     away = _directions(d, map_T_scan, middle)
     views = np.minimum(((np.arctan2(away[:, 1], away[:, 0]) + np.pi) / (2 * np.pi) * VIEWS).astype(np.int64), VIEWS - 1)
     slope = slope - _seen_lean(slope, weight, away, order, ends) * away
-    trust = d.believed / np.maximum(d.sigma**2, 1e-6)
+    sigma = d.sigma
+    trust = d.believed / np.maximum(sigma**2, 1e-6)
     places, slopes = _Views(n, VIEW_SIGMA), _Views(n, VIEW_LEAN)
     forked = _forked_probability(_told(d, order, ends))
     blurred = np.zeros(n)
@@ -138,7 +139,7 @@ def shapes(
             place = middle[mine] + lever[mine, None] * out.slope[j]
         place = place - np.median(place, axis=0)
         places.add(j, place, trust[mine], views[mine])
-        blurred[j] = _blurred(place, d.sigma[mine])
+        blurred[j] = _blurred(place, sigma[mine])
     single = ~out.forked
     out.slope_var[single] = np.minimum(out.slope_var + BEND**2 + slopes.variance(), LEAN_PRIOR**2)[single]
     if measured:  # recorded detections are all spread that way, and the graph learns how far

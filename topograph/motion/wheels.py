@@ -149,8 +149,9 @@ def breaks(at: Stamps, enu: Array, antenna: Array, sigma: Array) -> list[tuple[i
     mid = 0.5 * (antenna[k] + antenna[k + 1])
     apart = np.linalg.norm(_put(turn, middle, target, before, mid) - _put(turn, middle, target, after, mid), axis=1)
     uneven = np.maximum(np.maximum(rms[before], rms[after]), sigma[k])
-    found = (apart > BREAK) & (apart > EVEN * uneven) & (np.minimum(reach[before], reach[after]) > LEAST_WAY)
-    found &= (np.diff(at)[k] < LONGEST_S * 1e9) & (apart >= maximum_filter1d(apart, 2 * n + 1))
+    sharp = apart / uneven  # beside the break itself, a window that holds it fits badly, and may part by more
+    found = (apart > BREAK) & (sharp > EVEN) & (np.minimum(reach[before], reach[after]) > LEAST_WAY)
+    found &= (np.diff(at)[k] < LONGEST_S * 1e9) & (sharp >= maximum_filter1d(sharp, 2 * n + 1))
     turned = np.abs(wrap(turn[after] - turn[before]))
     return [(int(k[i]), float(apart[i]), float(turned[i])) for i in np.flatnonzero(found)]
 
